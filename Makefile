@@ -1,0 +1,58 @@
+# Everything a person does with this repository. `make help` lists it.
+
+SECONDS ?= 0
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test quick check rig soak lock proto clean
+
+help: ## list these
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python >= 3.11 is needed; name one with: make PYTHON=python3.12 ..." >&2; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || { echo "on Debian and Ubuntu: apt install python3-venv" >&2; rm -rf $(VENV); exit 1; }
+
+$(VENV)/run.stamp: requirements/run.txt pyproject.toml | $(BIN)/python
+	@echo "installing vdms-rt into $(VENV)"
+	@$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements/run.txt
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(VENV)/dev.stamp: requirements/dev.txt $(VENV)/run.stamp
+	@echo "installing what the tests need"
+	@$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements/dev.txt
+	@touch $@
+
+demo: $(VENV)/run.stamp ## measure the virtual shaking table (SECONDS=10 ends by itself)
+	@$(BIN)/vdms-rt run --config config/demo.toml --seconds $(SECONDS)
+
+check: $(VENV)/dev.stamp ## format, lint, types, layers
+	@$(BIN)/ruff format --check --quiet . || { $(BIN)/ruff format --diff --quiet .; exit 1; }
+	@$(BIN)/ruff check --quiet .
+	@$(BIN)/mypy --no-error-summary
+	@$(BIN)/lint-imports --no-logo >.lint-imports.log 2>&1 || { cat .lint-imports.log; exit 1; }
+	@echo "check: clean"
+
+test: check ## everything that runs without a kernel of its own
+	@$(BIN)/pytest -m "not rig"
+
+quick: $(VENV)/dev.stamp ## the fast tests alone
+	@$(BIN)/pytest -q -m "not rig and not slow"
+
+rig: $(VENV)/dev.stamp ## the tests on real kernel drivers, in a virtual machine
+	@tests/rig/run
+
+lock: $(VENV)/dev.stamp ## write requirements/*.txt anew
+	@$(BIN)/pip install --quiet uv
+	@cd requirements && for f in run dev; do \
+	  extra=; [ $$f = run ] || extra=dev.in; \
+	  ../$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header ../pyproject.toml build.in $$extra -o $$f.txt; done
+
+proto: $(VENV)/dev.stamp ## compile wire/vdms.proto
+	@PATH=$(BIN):$$PATH $(BIN)/python -m grpc_tools.protoc -I src --python_out=src --mypy_out=src src/vdms_rt/wire/vdms.proto
+
+clean: ## remove what was built and installed
+	@rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .lint-imports.log
