@@ -99,6 +99,23 @@ def truth_bytes(t: Truth) -> bytes:
     ).SerializeToString()
 
 
+def truth_from(data: bytes) -> Truth:
+    """Return the truth in a serialised `vdms.Truth`."""
+    m = pb.Truth.FromString(data)
+    return Truth(
+        marker=m.marker,
+        frame=m.frame,
+        scan=Scan(m.scan),
+        stamp_ns=m.stamp_ns,
+        t_ns=m.t_ns,
+        x_mm=m.x_mm,
+        y_mm=m.y_mm,
+        rotation_mrad=m.rotation_mrad,
+        mean_x_mm=m.mean_x_mm,
+        mean_y_mm=m.mean_y_mm,
+    )
+
+
 def event_bytes(e: Event, session: int) -> bytes:
     """Return the event as a serialised `vdms.Event`."""
     return pb.Event(
