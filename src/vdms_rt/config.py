@@ -1,11 +1,10 @@
-"""One strict TOML file, read once before any thread, into frozen models with every bound checked."""
+"""One strict TOML file, read once before any thread, into frozen models with bounds on all."""
 
 from __future__ import annotations
 
 import difflib
 import json
 import tomllib
-import types
 import typing
 from fractions import Fraction
 from pathlib import Path
@@ -204,6 +203,7 @@ class SetUpSection(Section):
     directory: str = ""
     """Empty: $STATE_DIRECTORY of the service, else ~/.local/state/vdms-rt."""
     load: bool = True
+    store: bool = True
     reference_pictures: int = Field(default=30, ge=1, le=1000)
     still_px: float = Field(default=0.3, gt=0, le=10)
     """The most that any circle may move, peak to peak, while the reference is taken."""
@@ -274,6 +274,19 @@ class Config(Section):
         return self
 
 
+def is_live(config: Config) -> bool:
+    """Return whether frames come at their own pace, and are lost if nobody takes them."""
+    match config.source:
+        case "clip":
+            return config.clip.pace == "realtime"
+        case "log":
+            return config.log.pace == "realtime"
+        case "table":
+            return config.table.pace == "realtime"
+        case _:
+            return True
+
+
 def load_config(path: Path | str | None) -> tuple[Config, str]:
     """Return the configuration and the text it came from (empty without a file).
 
@@ -304,7 +317,10 @@ def parse_config(text: str, source: str) -> Config:
     try:
         return Config.model_validate_json(json.dumps(document, default=str))
     except ValidationError as error:
-        lines = [_line(source, document, dict(e)) for e in error.errors()]
+        faults = error.errors()
+        # A list with a bad element is also reported as too short; the element says it all.
+        inner = {tuple(e["loc"][: n + 1]) for e in faults for n in range(len(e["loc"]) - 1)}
+        lines = [_line(source, document, dict(e)) for e in faults if tuple(e["loc"]) not in inner]
         raise ConfigError("\n".join(lines)) from None
 
 
@@ -331,9 +347,7 @@ def _line(source: str, document: dict[str, Any], error: dict[str, Any]) -> str:
 def _key(location: list[Any]) -> str:
     text = ""
     for part in location:
-        text += (
-            f"[{part + 1}]" if isinstance(part, int) else f".{part}" if text else str(part)
-        )
+        text += f"[{part + 1}]" if isinstance(part, int) else f".{part}" if text else str(part)
     return text
 
 
@@ -356,6 +370,6 @@ def _known_names(location: list[Any]) -> list[str]:
 
 
 def _section_of(annotation: Any) -> type[BaseModel]:
-    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
-        return annotation
-    return _section_of(typing.get_args(annotation)[0])
+    while arguments := typing.get_args(annotation):
+        annotation = arguments[0]
+    return typing.cast("type[BaseModel]", annotation)
