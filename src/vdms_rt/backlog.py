@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from vdms_rt.logfile import LogAttachment, LogMessage
+from vdms_rt.logfile.writer import LogAttachment, LogMessage
 from vdms_rt.wire import vdms_pb2 as pb
 from vdms_rt.wire.topics import Topic
 

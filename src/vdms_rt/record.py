@@ -16,7 +16,7 @@ from pathlib import Path
 
 from vdms_rt.backlog import Backlog
 from vdms_rt.config import Record
-from vdms_rt.logfile import LogAttachment, LogMessage, LogWriter
+from vdms_rt.logfile.writer import LogAttachment, LogMessage, LogWriter
 from vdms_rt.model import Event, Severity, VdmsError
 from vdms_rt.wire import topics
 from vdms_rt.wire import vdms_pb2 as pb

@@ -96,7 +96,7 @@ class LogWriter:
         self._fd = os.open(self.part_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            _sync_directory(path.parent)
+            sync_directory(path.parent)
         except OSError:
             os.close(self._fd)
             self.part_path.unlink(missing_ok=True)
@@ -179,7 +179,7 @@ class LogWriter:
             if self.path.exists():
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path))
             self.part_path.rename(self.path)
-            _sync_directory(self.path.parent)
+            sync_directory(self.path.parent)
         os.close(self._fd)
 
     def abandon(self) -> None:
@@ -220,7 +220,7 @@ def schema_bytes(message: type[ProtobufMessage]) -> bytes:
     return descriptors.SerializeToString()
 
 
-def _sync_directory(directory: Path) -> None:
+def sync_directory(directory: Path) -> None:
     fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(fd)

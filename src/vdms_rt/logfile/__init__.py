@@ -1,0 +1,1 @@
+"""One MCAP of ours: written so that it survives, read however it ended, and repaired."""
