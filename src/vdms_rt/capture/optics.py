@@ -15,7 +15,7 @@ Floats: TypeAlias = NDArray[np.float64]
 
 PHASES = 512
 """Sub-pixel positions for which the blur is tabulated; linear between them, to 1e-6."""
-TAIL_SIGMAS = 4.2
+TAIL_SIGMAS = 3.7
 SHARP_PX = 0.3
 """Below this blur an outline is cut into short chords; above, quadrature needs few points."""
 

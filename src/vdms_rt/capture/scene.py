@@ -24,7 +24,14 @@ Floats: TypeAlias = NDArray[np.float64]
 Greys: TypeAlias = NDArray[np.float32]
 """Grey levels before noise and rounding, shape (height, width), dtype float32."""
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+SPACING_BLURS = 1.3
+"""Between the points of an outline, in standard deviations of the blur: the aliasing of the
+trapezoidal rule is exp(-2 pi^2 / 1.3^2) = 1e-5 of the contrast."""
+
+
+EDGES = 4
+CROWD = 6
+"""Points over which the spacing shrinks towards a corner."""
 
 
 class Pose(NamedTuple):
@@ -37,14 +44,24 @@ class Pose(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """One sheet as outlines: points and the steps along them, (n, 2) mm, its edge first."""
+    """One sheet as outlines: its four edges, then its circles, counter-clockwise."""
 
     points_mm: Floats
     steps_mm: Floats
-    edge_points: int
+    """Along the outline to the next point; both (n, 2)."""
+    parts: tuple[slice, ...]
+    """The points of each edge and circle."""
     ground_grey: float
     ink_grey: float
     moves: bool
+
+
+class Lit(NamedTuple):
+    """Part of the picture, from row `top` and column `left` on."""
+
+    top: int
+    left: int
+    light: Floats
 
 
 class Scene:
@@ -66,7 +83,7 @@ class Scene:
         self.blur_px = math.sqrt(min(table.blur_x_px, table.blur_y_px) ** 2 + 1 / 12)
         self._blur_px = (table.blur_x_px, table.blur_y_px)
         self._sharp = min(self._blur_px) < SHARP_PX
-        self._spacing_px = 0.1 if self._sharp else min(self._blur_px)
+        self._spacing_px = 0.1 if self._sharp else SPACING_BLURS * min(self._blur_px)
         edge, self._edge_y = (edge_response(blur) for blur in self._blur_px)
         reach_x_px, self._reach_y_px = (0.5 + TAIL_SIGMAS * blur for blur in self._blur_px)
         self._columns = Taps(lambda d: edge(d) - edge(d - 1), -reach_x_px, reach_x_px + 1, 1)
@@ -88,6 +105,7 @@ class Scene:
         across = np.arange(table.width_px) / (table.width_px - 1) - 0.5
         self._light = (1 + table.light_gradient * across).astype(np.float32)
         wall = table.black_grey + 0.5 * (table.white_grey - table.black_grey)
+        self._ground = np.zeros((table.height_px, table.width_px))
         still = [s for s in self._sheets if not s.moves]
         self._moving = [s for s in self._sheets if s.moves]
         self._base: Greys = np.full((table.height_px, table.width_px), wall, np.float32)
@@ -116,7 +134,6 @@ class Scene:
             p, s = self._straight(begin, end)
             points.append(p)
             steps.append(s)
-        edge_points = sum(map(len, points))
         for centre in np.array(shape.circles_mm) + at_mm:
             p, s = self._circle(centre, shape.diameter_mm / 2)
             points.append(p)
@@ -124,7 +141,9 @@ class Scene:
         ground, ink = table.black_grey, table.white_grey
         if not shape.white_on_black:
             ground, ink = ink, ground
-        return Sheet(np.concatenate(points), np.concatenate(steps), edge_points, ground, ink, moves)
+        ends = np.cumsum([len(p) for p in points])
+        parts = tuple(slice(end - len(p), end) for end, p in zip(ends, points, strict=True))
+        return Sheet(np.concatenate(points), np.concatenate(steps), parts, ground, ink, moves)
 
     def _length_px(self, points_mm: Floats, steps_mm: Floats) -> float:
         """Return the longest step in the picture, with room for motion towards the camera."""
@@ -142,53 +161,66 @@ class Scene:
         return points(max(16, math.ceil(64 * self._length_px(*points(64)) / self._spacing_px)))
 
     def _straight(self, begin_mm: Floats, end_mm: Floats) -> tuple[Floats, Floats]:
-        def points(panels: int) -> tuple[Floats, Floats]:
-            if self._sharp:
-                t = (np.arange(panels) + 0.5) / panels
-                weights = np.full(panels, 1 / panels)
-            else:
-                t = ((np.arange(panels)[:, None] + 0.5 + _NODES / 2) / panels).ravel()
-                weights = np.tile(_WEIGHTS / 2 / panels, panels)
-            return begin_mm + t[:, None] * (end_mm - begin_mm), weights[:, None] * (
-                end_mm - begin_mm
-            )
-
-        whole_px = 64 * self._length_px(
-            begin_mm + np.linspace(0, 1, 64)[:, None] * (end_mm - begin_mm),
-            np.tile((end_mm - begin_mm) / 64, (64, 1)),
-        )
-        return points(math.ceil(whole_px / (self._spacing_px * (1 if self._sharp else 6))))
+        """Return points that crowd towards both ends, so that corners do not spoil the rule."""
+        edge_mm = end_mm - begin_mm
+        middles = begin_mm + (np.arange(64)[:, None] + 0.5) / 64 * edge_mm
+        length_px = 64 * self._length_px(middles, np.tile(edge_mm / 64, (64, 1)))
+        count = math.ceil(length_px / self._spacing_px)
+        if self._sharp:
+            t, density = (np.arange(count) + 0.5) / count, np.full(count, 1 / count)
+        else:
+            t, density = _graded(count + CROWD)
+        return begin_mm + t[:, None] * edge_mm, density[:, None] * edge_mm
 
     def _paint(
         self, view: Greys, sheet: Sheet, poses: Sequence[Pose], first_row: int, row_step: int
     ) -> None:
-        traced = [self._trace(sheet, pose) for pose in poses]
-        points = np.concatenate([p for p, _ in traced])
-        y_steps = np.concatenate([s for _, s in traced])
-        inked = np.tile(np.arange(len(sheet.points_mm)) >= sheet.edge_points, len(poses))
+        traces = [self._trace(sheet, pose) for pose in poses]
+        edges, circles = (
+            [
+                self._lit(points[part], y_steps[part], view.shape, first_row, row_step)
+                for points, y_steps in traces
+                for part in parts
+            ]
+            for parts in (sheet.parts[:EDGES], sheet.parts[EDGES:])
+        )
+        rows = slice(min(p.top for p in edges), max(p.top + p.light.shape[0] for p in edges))
+        columns = slice(min(p.left for p in edges), max(p.left + p.light.shape[1] for p in edges))
+        ground = self._ground[rows, columns]
+        ground[:] = 0
+        for top, left, light in edges:
+            here = ground[top - rows.start :][: light.shape[0], left - columns.start :]
+            here[:, : light.shape[1]] += light
+            here[:, light.shape[1] :] += light[:, -1:]
+        behind = view[rows, columns]
+        behind += ground * (sheet.ground_grey * self._light[columns] - behind)
+        for top, left, light in circles:
+            height, width = light.shape
+            brightness = (sheet.ink_grey - sheet.ground_grey) * self._light[left : left + width]
+            view[top : top + height, left : left + width] += light * brightness
+
+    def _lit(
+        self, points: Floats, y_steps: Floats, shape: tuple[int, int], first_row: int, row_step: int
+    ) -> Lit:
+        """Return what part of each pixel's light comes from the right of a piece of outline."""
         left, across = self._columns.at(points[:, 0])
         if self._sharp:
             top, down = self._chords(points[:, 1], y_steps, first_row, row_step)
         else:
             top, down = self._rows[row_step].at((points[:, 1] - first_row) / row_step)
             down *= y_steps[:, None]
-        rows = slice(*_clip(top, down.shape[1], view.shape[0]))
-        columns = slice(*_clip(left, across.shape[1], view.shape[1]))
-        height, width = rows.stop - rows.start, columns.stop - columns.start
-        if height <= 0 or width <= 0:
-            return
-        row = top[:, None] + np.arange(down.shape[1]) - rows.start
+        row_0, height = _span(top, down.shape[1], shape[0])
+        column_0, width = _span(left, across.shape[1], shape[1])
+        row = top[:, None] - row_0 + np.arange(down.shape[1])
         row[(row < 0) | (row >= height)] = height
-        row += (inked * (height + 1))[:, None]
-        column = np.clip(left[:, None] + np.arange(across.shape[1]) - columns.start, 0, width)
-        where = row[:, :, None] * (width + 1) + column[:, None, :]
-        light = down[:, :, None] * across[:, None, :]
-        rises = np.bincount(where.ravel(), light.ravel(), 2 * (height + 1) * (width + 1))
-        rises = rises.reshape(2, height + 1, width + 1)[:, :height, :width]
-        ground, ink = np.cumsum(rises, axis=2).astype(np.float32)
-        behind = view[rows, columns]
-        front = sheet.ground_grey * ground + (sheet.ink_grey - sheet.ground_grey) * ink
-        behind += self._light[columns] * front - behind * ground
+        column = np.clip(left[:, None] - column_0 + np.arange(across.shape[1]), 0, width)
+        pixel = row[:, :, None] * (width + 1) + column[:, None, :]
+        rise = np.bincount(
+            pixel.ravel(),
+            (down[:, :, None] * across[:, None, :]).ravel(),
+            (height + 1) * (width + 1),
+        ).reshape(height + 1, width + 1)
+        return Lit(row_0, column_0, np.cumsum(rise[:height, :width], axis=1))
 
     def _trace(self, sheet: Sheet, pose: Pose) -> tuple[Floats, Floats]:
         homography = self.camera.homography(pose.shake_mm)
@@ -217,5 +249,20 @@ def sheet_mm(shape: MarkerShape) -> tuple[float, float, float, float]:
     return float(left), float(bottom), float(right), float(top)
 
 
-def _clip(first: NDArray[np.intp], count: int, size: int) -> tuple[int, int]:
-    return max(0, int(first.min())), min(size, int(first.max()) + count)
+def _graded(count: int) -> tuple[Floats, Floats]:
+    """Return `count` points of 0..1 and their weights in a trapezoidal rule that is exact to high
+    order at the ends too: their density rises there from zero with three derivatives."""
+    count = max(count, 2 * CROWD)
+    z = np.arange(count) + 0.5
+    from_end = np.minimum(z, count - z)
+    u = np.minimum(from_end / CROWD, 1.0)
+    density = u**4 * (35 - 84 * u + 70 * u**2 - 20 * u**3)
+    gone = CROWD * u**5 * (7 - 14 * u + 10 * u**2 - 2.5 * u**3) + np.maximum(from_end - CROWD, 0)
+    t = gone / (count - CROWD)
+    return np.where(z < count / 2, t, 1 - t), density / (count - CROWD)
+
+
+def _span(first: NDArray[np.intp], count: int, size: int) -> tuple[int, int]:
+    """Return the first of `size` pixels that is touched, and how many are, at least one."""
+    begin = min(max(int(first.min()), 0), size - 1)
+    return begin, max(min(int(first.max()) + count, size) - begin, 1)
