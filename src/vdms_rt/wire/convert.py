@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from vdms_rt.model import (
     Circle,
     CircleFlag,
     Displacement,
     Event,
+    Frame,
     Health,
+    Luma,
+    Region,
     Scan,
     Severity,
     State,
@@ -15,6 +22,9 @@ from vdms_rt.model import (
     Truth,
 )
 from vdms_rt.wire import vdms_pb2 as pb
+
+RAW8 = "raw8"
+"""Patch.codec of one byte a pixel, row by row: the log's chunks compress it (decision 0001)."""
 
 
 def displacement_bytes(d: Displacement) -> bytes:
@@ -179,3 +189,88 @@ def health_from(data: bytes) -> Health:
     values = {name: getattr(m, name) for name in Health.__dataclass_fields__}
     values["state"] = State(m.state)
     return Health(**values)
+
+
+def pixels_bytes(
+    frame: Frame,
+    markers: Sequence[str],
+    regions: Sequence[Sequence[Region]],
+    setup_revision: int,
+    whole: bool,
+) -> bytes:
+    """Return a serialised `vdms.Pixels` with a copy of each marker's regions, in the order of its
+    circles, or of the whole image; empty if there is nothing to copy.
+
+    Regions are in rows of the whole frame, and are cut to the image. Of an image that is one
+    field alone a patch holds every second row.
+    """
+    height_px, width_px = frame.image.shape
+    row_step = 2 if frame.scan in (Scan.TOP, Scan.BOTTOM) else 1
+    row_offset = 1 if frame.scan is Scan.BOTTOM else 0
+    if whole:
+        named = [("", 0, Region(0, row_offset, width_px, height_px * row_step))]
+    else:
+        named = [
+            (marker, circle, region)
+            for marker, circles in zip(markers, regions, strict=bool(regions))
+            for circle, region in enumerate(circles)
+        ]
+    patches = []
+    for marker, circle, region in named:
+        left, right = max(region.x_px, 0), min(region.x_px + region.width_px, width_px)
+        top = max(-((row_offset - region.y_px) // row_step), 0)
+        end = -((row_offset - region.y_px - region.height_px) // row_step)
+        bottom = min(end, height_px)
+        if left < right and top < bottom:
+            patches.append(
+                pb.Patch(
+                    marker=marker,
+                    circle=circle,
+                    x_px=left,
+                    y_px=row_offset + top * row_step,
+                    width_px=right - left,
+                    height_px=bottom - top,
+                    row_step=row_step,
+                    codec=RAW8,
+                    data=frame.image[top:bottom, left:right].tobytes(),
+                )
+            )
+    if not patches:
+        return b""
+    return pb.Pixels(
+        frame_seq=frame.seq,
+        scan=int(frame.scan),  # type: ignore[arg-type]
+        stamp_ns=frame.stamp_ns,
+        t_ns=frame.t_ns,
+        sigma_t_ns=frame.sigma_t_ns,
+        utc_ns=frame.utc_ns,
+        segment=frame.segment,
+        setup_revision=setup_revision,
+        damage=int(frame.damage),
+        width_px=width_px,
+        height_px=height_px,
+        patches=patches,
+    ).SerializeToString()
+
+
+def paste_pixels(pixels: pb.Pixels, out: Luma) -> None:
+    """Fill `out`, (height_px, width_px) of the message, with its patches, and the rest with 0.
+
+    The inverse of `pixels_bytes`. Raises ValueError with a phrase if a patch does not fit or is
+    in a codec that is not known.
+    """
+    row_step = 2 if pixels.scan in (pb.TOP, pb.BOTTOM) else 1
+    row_offset = 1 if pixels.scan == pb.BOTTOM else 0
+    out[:] = 0
+    for patch in pixels.patches:
+        if patch.codec != RAW8:
+            raise ValueError(f"pixels in the codec {patch.codec!r}, which is not known here")
+        top, shift = divmod(patch.y_px - row_offset, row_step)
+        bottom, right = top + patch.height_px, patch.x_px + patch.width_px
+        size = patch.height_px * patch.width_px
+        fits = bottom <= out.shape[0] and right <= out.shape[1] and len(patch.data) == size
+        if shift or patch.row_step != row_step or top < 0 or not fits:
+            raise ValueError("a patch that does not fit into its picture")
+        out[top:bottom, patch.x_px : right] = np.frombuffer(patch.data, np.uint8).reshape(
+            patch.height_px, patch.width_px
+        )
