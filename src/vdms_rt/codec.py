@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from vdms_rt.model import Luma
 
-cv2.setLogLevel(2)  # errors; a picture that cannot be read is told in our own words
+# A picture that cannot be read is told in our own words.
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
