@@ -245,6 +245,7 @@ def pixels_bytes(
         sigma_t_ns=frame.sigma_t_ns,
         utc_ns=frame.utc_ns,
         segment=frame.segment,
+        period_ns=frame.period_ns,
         setup_revision=setup_revision,
         damage=int(frame.damage),
         width_px=width_px,

@@ -623,6 +623,7 @@ class Pixels(_message.Message):
     WIDTH_PX_FIELD_NUMBER: _builtins.int
     HEIGHT_PX_FIELD_NUMBER: _builtins.int
     PATCHES_FIELD_NUMBER: _builtins.int
+    PERIOD_NS_FIELD_NUMBER: _builtins.int
     frame_seq: _builtins.int
     scan: Global___Scan.ValueType
     stamp_ns: _builtins.int
@@ -636,6 +637,8 @@ class Pixels(_message.Message):
     width_px: _builtins.int
     """of the whole image that the patches are cut from"""
     height_px: _builtins.int
+    period_ns: _builtins.int
+    """from one frame to the next"""
     @_builtins.property
     def patches(self) -> _containers.RepeatedCompositeFieldContainer[Global___Patch]: ...
     def __init__(
@@ -653,10 +656,11 @@ class Pixels(_message.Message):
         width_px: _builtins.int = ...,
         height_px: _builtins.int = ...,
         patches: _abc.Iterable[Global___Patch] | None = ...,
+        period_ns: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["damage", b"damage", "frame_seq", b"frame_seq", "height_px", b"height_px", "patches", b"patches", "scan", b"scan", "segment", b"segment", "setup_revision", b"setup_revision", "sigma_t_ns", b"sigma_t_ns", "stamp_ns", b"stamp_ns", "t_ns", b"t_ns", "utc_ns", b"utc_ns", "width_px", b"width_px"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["damage", b"damage", "frame_seq", b"frame_seq", "height_px", b"height_px", "patches", b"patches", "period_ns", b"period_ns", "scan", b"scan", "segment", b"segment", "setup_revision", b"setup_revision", "sigma_t_ns", b"sigma_t_ns", "stamp_ns", b"stamp_ns", "t_ns", b"t_ns", "utc_ns", b"utc_ns", "width_px", b"width_px"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
