@@ -1,0 +1,255 @@
+"""The command line: verbs, their help, exit codes; no logic."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import vdms_rt
+from vdms_rt.config import effective_values, load_config
+from vdms_rt.model import ConfigError, MarkerShape, VdmsError
+
+EXIT_STOPPED = 0
+EXIT_FAILED = 1
+EXIT_CONFIG = 78
+"""EX_CONFIG of sysexits.h; the service is not restarted on it."""
+
+DEFAULT_ADDRESS = "tcp/127.0.0.1:7447"
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Carry out one command line and return the exit status."""
+    parsed = _parser().parse_args(arguments)
+    try:
+        return int(parsed.verb(parsed))
+    except ConfigError as error:
+        print(_each_line("vdms-rt: ", error), file=sys.stderr)
+        return EXIT_CONFIG
+    except VdmsError as error:
+        print(_each_line("vdms-rt: ", error), file=sys.stderr)
+        return EXIT_FAILED
+    except KeyboardInterrupt:
+        return EXIT_STOPPED
+
+
+def _each_line(prefix: str, error: VdmsError) -> str:
+    return "\n".join(prefix + line for line in str(error).splitlines())
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="vdms-rt",
+        description=vdms_rt.__doc__,
+        epilog="exit status: 0 stopped, 1 failed, 78 bad configuration",
+    )
+    parser.add_argument("--version", action="version", version=f"vdms-rt {vdms_rt.__version__}")
+    verbs = parser.add_subparsers(metavar="VERB", required=True)
+
+    verb = _verb(
+        verbs,
+        "run",
+        _run,
+        "measure, publish and record until stopped",
+        "Take frames from the source of the configuration, find the marker, wait until it rests, "
+        "take the reference, and from then on publish and record its displacement in millimetres. "
+        "Ctrl-C ends the run in order; a second one at once.",
+    )
+    verb.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="TOML file; without it the first grabber is used",
+    )
+    verb.add_argument(
+        "--seconds",
+        type=_seconds,
+        default=0.0,
+        metavar="N",
+        help="end N seconds after the first frame (0, the default: go on)",
+    )
+
+    verb = _verb(
+        verbs,
+        "check-config",
+        _check_config,
+        "check a configuration file and say all that is wrong with it",
+        "Read the file, check every key and bound, and print either every fault, one a line with "
+        "file, key, value and rule, or (with --show) all values in force.",
+    )
+    verb.add_argument("file", type=Path, metavar="FILE")
+    verb.add_argument("--show", action="store_true", help="print every value in force, as JSON")
+
+    _verb(
+        verbs,
+        "devices",
+        _devices,
+        "list the grabbers and cameras of this computer",
+        "For each video device: node, driver, USB identity, inputs, standards, formats, and what "
+        "to write into the configuration to use it.",
+    )
+
+    verb = _verb(
+        verbs,
+        "find",
+        _find,
+        "find the marker in a picture or clip",
+        "Search the marker in a picture (PNG, PGM, JPEG), the first frame of a clip, or a folder "
+        "of pictures; print its regions as configuration and write the picture with the regions "
+        "drawn. Exit status 1 if no marker is there.",
+    )
+    verb.add_argument("path", type=Path, metavar="PICTURE|CLIP")
+    verb.add_argument(
+        "--config", type=Path, metavar="FILE", help="for other markers than the default sheet"
+    )
+    verb.add_argument(
+        "--out",
+        type=Path,
+        metavar="PNG",
+        help="the drawn picture (default: found.png)",
+        default=Path("found.png"),
+    )
+
+    verb = _verb(
+        verbs,
+        "marker",
+        _marker,
+        "make the printable marker sheet",
+        "Write a true-to-scale sheet with four circles and a ruler to check the print by. Measure "
+        "the ruler after printing: a scaled print is a scaled displacement.",
+    )
+    verb.add_argument(
+        "--spacing-mm",
+        type=_millimetres,
+        default=120.0,
+        metavar="MM",
+        help="between neighbouring centres (default: 120)",
+    )
+    verb.add_argument(
+        "--diameter-mm",
+        type=_millimetres,
+        default=50.0,
+        metavar="MM",
+        help="of each circle (default: 50)",
+    )
+    verb.add_argument(
+        "--black-on-white", action="store_true", help="black circles on a white sheet"
+    )
+    verb.add_argument(
+        "--out",
+        type=Path,
+        default=Path("marker.pdf"),
+        metavar="FILE",
+        help=".pdf or .svg (default: marker.pdf)",
+    )
+
+    verb = _verb(
+        verbs,
+        "watch",
+        _watch,
+        "show a running station's displacement in this terminal",
+        "Connect to a station, here or on another computer, and show numbers, state and a moving "
+        "plot; with --csv also write every sample. A station that stops and comes back is "
+        "picked up again. Ctrl-C ends it.",
+    )
+    verb.add_argument(
+        "--connect",
+        default=DEFAULT_ADDRESS,
+        metavar="ADDRESS",
+        help=f"where the station listens (default: {DEFAULT_ADDRESS})",
+    )
+    verb.add_argument("--csv", type=Path, metavar="FILE", help="write every sample to this file")
+    verb.add_argument(
+        "--seconds", type=_seconds, default=0.0, metavar="N", help="end after N seconds"
+    )
+    return parser
+
+
+def _verb(
+    verbs: Any, name: str, body: Callable[[argparse.Namespace], int], short: str, long: str
+) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = verbs.add_parser(
+        name, help=short, description=f"{short[0].upper()}{short[1:]}. {long}"
+    )
+    parser.set_defaults(verb=body)
+    return parser
+
+
+def _seconds(text: str) -> float:
+    return _number(text, 0.0, 1e9, "seconds, 0 or more")
+
+
+def _millimetres(text: str) -> float:
+    return _number(text, 1.0, 10000.0, "millimetres, between 1 and 10000")
+
+
+def _number(text: str, least: float, most: float, rule: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not least <= value <= most:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of {rule}")
+    return value
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from vdms_rt.console import Console
+    from vdms_rt.daemon import Daemon
+
+    config, text = load_config(arguments.config)
+    console = Console()
+    logging.basicConfig(level=logging.INFO, handlers=[console])
+    return Daemon(config, text, console).run(arguments.seconds)
+
+
+def _check_config(arguments: argparse.Namespace) -> int:
+    config, _ = load_config(arguments.file)
+    print(effective_values(config) if arguments.show else f"{arguments.file}: correct")
+    return EXIT_STOPPED
+
+
+def _devices(_: argparse.Namespace) -> int:
+    from vdms_rt.capture.grabber import devices_table, list_devices
+
+    devices = list_devices()
+    print(devices_table(devices))
+    return EXIT_STOPPED if devices else EXIT_FAILED
+
+
+def _find(arguments: argparse.Namespace) -> int:
+    from vdms_rt.look import look
+
+    config, _ = load_config(arguments.config)
+    text, found = look(arguments.path, config, arguments.out)
+    print(text)
+    return EXIT_STOPPED if found else EXIT_FAILED
+
+
+def _marker(arguments: argparse.Namespace) -> int:
+    from vdms_rt.sheet import write_sheet
+
+    half_mm = arguments.spacing_mm / 2
+    shape = MarkerShape(
+        name="m1",
+        circles_mm=(
+            (-half_mm, half_mm),
+            (half_mm, half_mm),
+            (-half_mm, -half_mm),
+            (half_mm, -half_mm),
+        ),
+        diameter_mm=arguments.diameter_mm,
+        white_on_black=not arguments.black_on_white,
+    )
+    print(write_sheet(shape, arguments.out))
+    return EXIT_STOPPED
+
+
+def _watch(arguments: argparse.Namespace) -> int:
+    from vdms_rt.watch import run_watch
+
+    return run_watch(arguments.connect, arguments.csv, seconds=arguments.seconds)

@@ -1,0 +1,133 @@
+"""Everything said in a run goes through here: encoded once, the same bytes to network and log."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from dataclasses import replace
+
+from vdms_rt import codec
+from vdms_rt.model import Displacement, Event, Frame, Health, Luma, Region, Severity, Truth
+from vdms_rt.publish import Publisher
+from vdms_rt.record import Recorder
+from vdms_rt.report import set_up_report
+from vdms_rt.setup import SetUp, set_up_json
+from vdms_rt.wire import convert, topics
+from vdms_rt.wire import vdms_pb2 as pb
+from vdms_rt.wire.topics import Topic
+
+log = logging.getLogger("vdms_rt")
+
+LEVELS = {
+    Severity.INFO: logging.INFO,
+    Severity.WARNING: logging.WARNING,
+    Severity.ERROR: logging.ERROR,
+}
+
+
+class Outlet:
+    """Used by all threads. Sinks are attached before the threads start."""
+
+    def __init__(
+        self, station: str, markers: tuple[str, ...], session: int, *, live: bool, patches: str
+    ) -> None:
+        self.publisher: Publisher | None = None
+        self.recorder: Recorder | None = None
+        self._station = station
+        self.session = session
+        self._markers = markers
+        self.newest_set_up: SetUp | None = None
+        self._live = live
+        self._patches = patches
+        self._utc_offset_ns = time.time_ns() - time.monotonic_ns()
+        self._newest_ns = 0
+        self._lock = threading.Lock()
+        self._age_sum_ms = 0.0
+        self._age_count = 0
+
+    def now_ns(self) -> int:
+        """Return the log time of what happens now: UTC, or behind a source that is not live the
+        time of the newest sample, so that a file has one clock."""
+        return time.time_ns() if self._live else self._newest_ns
+
+    def displacement(self, sample: Displacement) -> None:
+        """Say one sample."""
+        self._newest_ns = sample.utc_ns or sample.t_ns
+        self._say(
+            topics.DISPLACEMENT,
+            sample.marker,
+            self._newest_ns,
+            convert.displacement_bytes(sample),
+        )
+        if self._live:
+            with self._lock:
+                self._age_sum_ms += (time.monotonic_ns() - sample.t_ns) / 1e6
+                self._age_count += 1
+
+    def sample_age_ms(self) -> float:
+        """Return the mean age of the samples since the last call, NaN without any."""
+        with self._lock:
+            mean = self._age_sum_ms / self._age_count if self._age_count else math.nan
+            self._age_sum_ms, self._age_count = 0.0, 0
+        return mean
+
+    def truth(self, truth: Truth) -> None:
+        """Say where the virtual table's sheet really was."""
+        at_ns = truth.t_ns + self._utc_offset_ns if self._live else truth.t_ns
+        self._say(topics.TRUTH, truth.marker, at_ns, convert.truth_bytes(truth))
+
+    def event(self, event: Event) -> None:
+        """Say that something happened, to the network, the log and the console."""
+        if not event.utc_ns and not event.t_ns:
+            event = replace(event, utc_ns=self.now_ns())
+        log.log(LEVELS[event.severity], event.text)
+        self._say(
+            topics.EVENT,
+            "",
+            event.utc_ns or event.t_ns,
+            convert.event_bytes(event, self.session),
+        )
+
+    def set_up(self, set_up: SetUp, image: Luma) -> None:
+        """Say the set-up now in force; `image` is a picture taken with it."""
+        self.newest_set_up = set_up
+        message = pb.SetUp(
+            session=self.session,
+            utc_ns=set_up.utc_ns,
+            revision=set_up.revision,
+            json=set_up_json(set_up),
+            report=set_up_report(set_up),
+        )
+        self._say(topics.SETUP, "", self.now_ns(), message.SerializeToString())
+        if self.recorder is not None:
+            self.recorder.attach(f"reference-{set_up.revision}.png", "image/png", codec.png(image))
+
+    def pixels(
+        self,
+        frame: Frame,
+        regions: tuple[tuple[Region, ...], ...],
+        revision: int,
+    ) -> None:
+        """Log the frame's regions, or all of it, without loss."""
+        if self.recorder is None or self._patches == "none":
+            return
+        data = convert.pixels_bytes(
+            frame, self._markers, regions, revision, self._patches == "frames"
+        )
+        if data:
+            self._say(topics.PIXELS, "", frame.utc_ns or frame.t_ns, data)
+
+    def health(self, health: Health) -> None:
+        """Say how the daemon is."""
+        self._say(
+            topics.HEALTH, "", self.now_ns(), convert.health_message(health).SerializeToString()
+        )
+
+    def _say(self, topic: Topic, marker: str, at_ns: int, data: bytes) -> None:
+        if topic.network and self.publisher is not None:
+            self.publisher.put(topic, marker, data)
+        if topic.recorded and self.recorder is not None:
+            key = topic.key.format(station=self._station, marker=marker)
+            self.recorder.put(topic, key, at_ns, data)

@@ -1,0 +1,192 @@
+"""The process thread: frames in, displacements out; all that measures is in `step`."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from vdms_rt.config import Config
+from vdms_rt.model import (
+    Displacement,
+    Event,
+    FoundMarker,
+    Frame,
+    Luma,
+    Picture,
+    Region,
+    Scan,
+    Severity,
+    State,
+    Status,
+)
+from vdms_rt.process.pictures import pictures
+from vdms_rt.process.progress import Phase, Plan, Progress
+from vdms_rt.process.step import begin, found, step, trusted
+from vdms_rt.ring import Ring, RingClosed
+from vdms_rt.setup import SetUp, mismatch
+
+SEARCH_S = 0.5
+"""Least time between two searches: they cost a quarter of a core at this pace."""
+TAKE_TIMEOUT_S = 0.2
+
+
+class Outlet(Protocol):
+    """Where the process thread hands things on; none of these waits behind a live source."""
+
+    def displacement(self, sample: Displacement) -> None: ...
+
+    def event(self, event: Event) -> None: ...
+
+    def set_up(self, set_up: SetUp, image: Luma) -> None: ...
+
+    def pixels(
+        self, frame: Frame, regions: tuple[tuple[Region, ...], ...], revision: int
+    ) -> None: ...
+
+
+class Search(Protocol):
+    """The search for markers in a picture, which goes on elsewhere."""
+
+    @property
+    def busy(self) -> bool: ...
+
+    def ask(self, image: Luma, scan: Scan) -> bool: ...
+
+    def answer(self, timeout_s: float = 0.0) -> tuple[FoundMarker, ...] | None: ...
+
+
+@dataclass(slots=True)
+class ProcessCounters:
+    """Written by the process thread alone, read by the supervisor."""
+
+    state: State = State.STARTING
+    measured: int = 0
+    invalid: int = 0
+    newest: Displacement | None = None
+
+
+class Processor:
+    """The loop around `step`: takes frames, asks the search, hands displacements on."""
+
+    def __init__(
+        self,
+        config: Config,
+        session: int,
+        stored: SetUp | None,
+        ring: Ring,
+        search: Search,
+        outlet: Outlet,
+        *,
+        trust_stored: bool = False,
+    ) -> None:
+        self.counters = ProcessCounters()
+        self._plan = Plan.of(config)
+        self._sampling = config.process.sampling
+        self._session = session
+        self._stored = stored
+        self._trust = trust_stored
+        self._ring = ring
+        self._search = search
+        self._outlet = outlet
+        self._progress: Progress | None = None
+        self._asked_ns: int | None = None
+        self._told_missing = False
+        if stored is not None and not trust_stored and (why := mismatch(stored, config)):
+            outlet.event(
+                Event(Severity.WARNING, "set-up-ignored", f"the stored set-up is ignored: {why}")
+            )
+            self._stored = None
+
+    def run(self, stop: threading.Event) -> None:
+        """Measure until the ring is closed and empty: the body of the process thread.
+
+        `stop` is only looked at by what waits for a search; the ring's end is what ends the loop.
+        """
+        while True:
+            try:
+                lease = self._ring.take(TAKE_TIMEOUT_S)
+            except RingClosed:
+                return
+            if lease is None:
+                continue
+            with lease as frame:
+                self._measure(frame, stop)
+
+    def _measure(self, frame: Frame, stop: threading.Event) -> None:
+        progress = self._progress_for(frame)
+        for picture in pictures(frame, self._sampling):
+            if progress.phase is Phase.SEARCHING:
+                progress = self._searched(progress, picture, stop)
+            before = progress.set_up
+            progress, samples, events = step(progress, picture)
+            for sample in samples:
+                self._count(sample)
+                self._outlet.displacement(sample)
+            if progress.set_up is not None and progress.set_up is not before:
+                self._outlet.set_up(progress.set_up, frame.image)
+            for event in events:
+                self._outlet.event(_at(event, picture))
+        self._outlet.pixels(frame, progress.regions, progress.revision)
+        self.counters.state = progress.state
+        self._progress = progress
+
+    def _progress_for(self, frame: Frame) -> Progress:
+        height_px, width_px = frame.image.shape
+        if frame.scan in (Scan.TOP, Scan.BOTTOM):
+            height_px *= 2
+        now = self._progress
+        if now is not None and (now.width_px, now.height_px) == (width_px, height_px):
+            return now
+        revision = now.revision if now else 0
+        if now is not None:
+            text = f"pictures are now {width_px} x {height_px} px; a new reference is needed"
+            self._outlet.event(Event(Severity.WARNING, "size-changed", text))
+        progress = begin(self._plan, self._session, width_px, height_px, revision, self._stored)
+        if self._trust and progress.phase is Phase.CHECKING:
+            progress = trusted(progress)
+        if progress.set_up is not None:
+            self._outlet.set_up(progress.set_up, frame.image)
+        return progress
+
+    def _searched(self, progress: Progress, picture: Picture, stop: threading.Event) -> Progress:
+        """Ask for a search and apply an answer. A source that is not live waits for the answer, so
+        that each run on it is the same."""
+        due = self._asked_ns is None or picture.t_ns - self._asked_ns >= SEARCH_S * 1e9
+        if due and not picture.damage and self._search.ask(picture.image, picture.scan):
+            self._asked_ns = picture.t_ns
+        answer = self._search.answer()
+        while answer is None and not self._ring.live and self._search.busy and not stop.is_set():
+            answer = self._search.answer(TAKE_TIMEOUT_S)
+        if answer is None:
+            return progress
+        progress, events = found(progress, answer)
+        if progress.phase is Phase.SEARCHING and not self._told_missing:
+            events = (*events, _missing(self._plan, answer))
+        self._told_missing = progress.phase is Phase.SEARCHING
+        for event in events:
+            self._outlet.event(_at(event, picture))
+        return progress
+
+    def _count(self, sample: Displacement) -> None:
+        if sample.valid:
+            self.counters.measured += 1
+        elif not sample.status & Status.SET_UP:
+            self.counters.invalid += 1
+        self.counters.newest = sample
+
+
+def _at(event: Event, picture: Picture) -> Event:
+    return dataclasses.replace(event, t_ns=picture.t_ns, utc_ns=picture.utc_ns)
+
+
+def _missing(plan: Plan, markers: Sequence[FoundMarker]) -> Event:
+    seen = {m.name for m in markers}
+    names = ", ".join(shape.name for shape in plan.shapes if shape.name not in seen)
+    text = (
+        f"no marker in sight: looking for {names}. All of its circles must be in the picture, "
+        "sharp, lit and not covered"
+    )
+    return Event(Severity.WARNING, "no-marker", text)
