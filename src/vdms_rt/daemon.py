@@ -43,6 +43,8 @@ SAMPLE_RATE_HZ = 60.0
 """The most that a marker is measured with an analogue source: sizes the history for subscribers."""
 STATUS_LINE_S = 0.2
 RATE_WINDOW_S = 3.0
+DRAIN_S = 1.5
+"""For measuring what is in the ring; after that what has no room in the recorder's queue is lost."""
 JOIN_S = 2.5
 """A stop takes less than 3 s; a thread that has not ended by then hangs, and is named."""
 
@@ -172,10 +174,12 @@ class Daemon:
         """Stop in the order of the data: capture, process, record."""
         self._stop.set()
         recorder = self._outlet.recorder
+        deadline_s = time.monotonic() + JOIN_S
+        threads["capture"].join(JOIN_S)
+        threads["process"].join(DRAIN_S)
         if recorder is not None:
             recorder.hurry()
-        deadline_s = time.monotonic() + JOIN_S
-        for name in ("capture", "process", "find"):
+        for name in ("process", "find"):
             threads[name].join(max(0.0, deadline_s - time.monotonic()))
         self._keep_set_up()
         self._outlet.health(self._health())
@@ -196,7 +200,8 @@ class Daemon:
                 raise fault
             traceback.print_exception(fault)
         health = self._health()
-        self._console.block(summary(health, []))
+        recorder = self._outlet.recorder
+        self._console.block(summary(health, recorder.files if recorder else ()))
         if failure := self._capture.counters.failure:
             log.error(failure)
         failed = self._faults or failure or health.record_trouble or not health.captured

@@ -102,7 +102,7 @@ class Outlet:
         )
         self._say(topics.SETUP, "", self.now_ns(), message.SerializeToString())
         if self.recorder is not None:
-            self.recorder.attach(f"reference-{set_up.revision}.png", "image/png", codec.png(image))
+            self.recorder.attach("reference.png", "image/png", codec.png(image))
 
     def pixels(
         self,

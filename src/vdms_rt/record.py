@@ -86,7 +86,7 @@ class Recorder:
         self._recorded = 0
         self._fsync_ms = 0.0
         self._disk_free_bytes = 0
-        self._path = ""
+        self._files: list[str] = []
         self._trouble = ""
 
         self._log: LogWriter | None = None
@@ -136,11 +136,17 @@ class Recorder:
                 queued=len(self._backlog),
                 fsync_ms=self._fsync_ms,
                 disk_free_bytes=self._disk_free_bytes,
-                file=self._path,
+                file=self._files[-1] if self._files else "",
                 trouble=self._trouble,
             )
             self._fsync_ms = 0.0
             return counters
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Paths of the files begun so far, as they are named once they are closed."""
+        with self._lock:
+            return tuple(self._files)
 
     def run(self) -> None:
         """Write what is queued until `finish` was called and everything is on the disk.
@@ -249,8 +255,10 @@ class Recorder:
         self._part_opened_s = time.monotonic()
         self._sync_due_s = 0.0
         with self._lock:
-            self._path = str(log.path)
-        self._tell(Severity.INFO, "recording", f"recording into {log.path}", ("file", self._path))
+            self._files.append(str(log.path))
+        self._tell(
+            Severity.INFO, "recording", f"recording into {log.path}", ("file", str(log.path))
+        )
         return log
 
     def _create(self) -> LogWriter:

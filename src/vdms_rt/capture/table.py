@@ -29,7 +29,7 @@ from vdms_rt.model import (
 
 Floats: TypeAlias = NDArray[np.float64]
 
-BUFFERS = 8
+BUFFERS = 32
 """Frames that wait for a late reader; the driver loses those after them."""
 _SCANS = {
     "progressive": Scan.PROGRESSIVE,
