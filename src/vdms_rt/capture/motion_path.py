@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import itertools
 import math
 from collections.abc import Callable
@@ -21,15 +22,21 @@ Strokes: TypeAlias = Callable[[Floats], Floats]
 
 STEP_RISE_S = 0.1
 """What a small servo-hydraulic table needs for a step."""
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
+
+
+@functools.cache
+def gauss_legendre(count: int) -> tuple[Floats, Floats]:
+    """Return nodes in -1..1 and weights that sum to 1, both (count,)."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return nodes, weights / 2
 
 
 class MotionPath:
     """The table's motion: `rest_s` of rest, then what the configuration asks for.
 
     The position is continuous. A harmonic is A sin(2 pi f t) from the first moment on. A sweep is
-    logarithmic (equal time for each octave, as in IEC 60068-2-6) with constant amplitude and goes
-    on at its end frequency. A step is a fifth-order polynomial without a jump in velocity or
+    logarithmic (equal time for each octave, as in IEC 60068-2-6) at constant amplitude and goes on
+    at its end frequency. A step is a fifth-order polynomial without a jump in velocity or
     acceleration, lasts STEP_RISE_S and stays. A record is a cubic spline through its rows,
     relative to the first one, and stays at its last.
     """
@@ -37,10 +44,11 @@ class MotionPath:
     def __init__(self, motion: Motion, rest_s: float) -> None:
         """Raises SourceError when the file of a record cannot be used."""
         self._rest_s = rest_s
-        self._strokes: Strokes
         self.reach_mm = motion.amplitude_mm
-        """The furthest that it ever gets from its rest."""
+        """The farthest that it ever gets from its rest."""
         highest_hz = motion.frequency_hz
+        duration_s = 0.0
+        self._strokes: Strokes
         match motion.kind:
             case "still":
                 self._strokes = _still
@@ -50,15 +58,18 @@ class MotionPath:
             case "sweep":
                 self._strokes = _sweep(motion)
                 highest_hz = max(motion.frequency_hz, motion.end_frequency_hz)
+                duration_s = motion.sweep_s
             case "step":
                 self._strokes = _step(motion.amplitude_mm)
-                highest_hz = 1 / STEP_RISE_S
+                highest_hz, duration_s = 1 / STEP_RISE_S, STEP_RISE_S
             case "record":
                 times_s, rows_mm = read_record(Path(motion.file))
                 rows_mm = rows_mm - rows_mm[0]
                 self._strokes = _spline(times_s - times_s[0], rows_mm)
                 self.reach_mm = float(np.hypot(rows_mm[:, 0], rows_mm[:, 1]).max())
-                highest_hz = float(1 / np.diff(times_s).min())
+                highest_hz = float(1 / np.median(np.diff(times_s)))
+                duration_s = float(times_s[-1] - times_s[0])
+        self._breaks_s = sorted({rest_s, rest_s + duration_s})
         self._panel_s = 0.5 / highest_hz
         angle = math.radians(motion.direction_deg)
         self._turn = np.array(
@@ -68,22 +79,23 @@ class MotionPath:
     def at(self, times_s: Floats) -> Floats:
         """Return the positions in the marker plane, (n, 2) mm, x right, y up, relative to the
         rest, at times since the start of the table, (n,) s."""
-        return self._strokes(np.maximum(times_s - self._rest_s, 0.0)) @ self._turn
+        return np.asarray(self._strokes(np.maximum(times_s - self._rest_s, 0.0)) @ self._turn)
 
     def mean(self, start_s: float, end_s: float) -> Floats:
         """Return the mean position from one time to another, (2,) mm, by Gauss-Legendre quadrature
-        with panels of at most half a period, split where motion begins."""
+        with panels of at most half a period, split where motion begins and ends."""
         if end_s <= start_s:
-            return self.at(np.array([start_s]))[0]
-        edges = [start_s, end_s]
-        if start_s < self._rest_s < end_s:
-            edges.insert(1, self._rest_s)
+            return np.asarray(self.at(np.array([start_s]))[0])
+        inside_s = [b for b in self._breaks_s if start_s < b < end_s]
+        edges = [start_s, *inside_s, end_s]
+        nodes, weights = gauss_legendre(10)
         total = np.zeros(2)
         for left_s, right_s in itertools.pairwise(edges):
-            panels = np.linspace(left_s, right_s, 1 + math.ceil((right_s - left_s) / self._panel_s))
-            half_s = (panels[1] - panels[0]) / 2
-            times_s = (panels[:-1, None] + half_s * (1 + _NODES)).ravel()
-            total += half_s * np.tile(_WEIGHTS, len(panels) - 1) @ self.at(times_s)
+            panels = math.ceil((right_s - left_s) / self._panel_s)
+            width_s = (right_s - left_s) / panels
+            middles_s = left_s + width_s * (np.arange(panels) + 0.5)
+            times_s = middles_s[:, None] + width_s / 2 * nodes
+            total += width_s * np.tile(weights, panels) @ self.at(times_s.ravel())
         return total / (end_s - start_s)
 
 

@@ -6,9 +6,11 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vdms_rt.capture.laboratory import laboratory_grey
 from vdms_rt.capture.optics import (
     SHARP_PX,
     TAIL_SIGMAS,
@@ -78,9 +80,10 @@ class Scene:
         """Raises SourceError when a sheet would touch the camera."""
         named = {shape.name: shape for shape in shapes}
         hung = [(sheet, named[sheet.marker]) for sheet in table.sheet]
-        _, bottom, _, top = sheet_mm(hung[0][1])
+        _, bottom, _, top = sheet_mm(hung[0][1] if hung else shapes[0])
         self.camera = Camera(table, top - bottom)
-        self.blur_px = math.sqrt(min(table.blur_x_px, table.blur_y_px) ** 2 + 1 / 12)
+        self._narrowest_px = math.sqrt(min(table.blur_x_px, table.blur_y_px) ** 2 + 1 / 12)
+        self._px_per_mm = self.camera.scale * max(1.0, table.pixel_aspect)
         self._blur_px = (table.blur_x_px, table.blur_y_px)
         self._sharp = min(self._blur_px) < SHARP_PX
         self._spacing_px = 0.1 if self._sharp else SPACING_BLURS * min(self._blur_px)
@@ -104,16 +107,20 @@ class Scene:
                 )
         across = np.arange(table.width_px) / (table.width_px - 1) - 0.5
         self._light = (1 + table.light_gradient * across).astype(np.float32)
-        wall = table.black_grey + 0.5 * (table.white_grey - table.black_grey)
-        self._ground = np.zeros((table.height_px, table.width_px))
-        still = [s for s in self._sheets if not s.moves]
-        self._moving = [s for s in self._sheets if s.moves]
-        self._base: Greys = np.full((table.height_px, table.width_px), wall, np.float32)
-        self._base *= self._light
-        rest = [Pose(1.0, (0.0, 0.0), (0.0, 0.0))]
-        for sheet in still:
-            self._paint(self._base, sheet, rest, 0, 1)
-        self.picture: Greys = self._base.copy()
+        self._ground = np.zeros((table.height_px, table.width_px), np.float32)
+        swing_px = table.shake_mm * self._px_per_mm
+        self._margin_px = math.ceil(swing_px) + 2 if swing_px else 0
+        self._laboratory = laboratory_grey(table, self._margin_px)
+        self._shakes = table.shake_mm > 0
+        self.picture: Greys = np.zeros((table.height_px, table.width_px), np.float32)
+        self._still: Greys = self.picture.copy()
+        self._front = self._sheets
+        if not self._shakes:
+            still = [sheet for sheet in self._sheets if not sheet.moves]
+            self._front = [sheet for sheet in self._sheets if sheet.moves]
+            self._still[:] = self._laboratory * self._light
+            for sheet in still:
+                self._paint(self._still, sheet, [Pose(1.0, (0.0, 0.0), (0.0, 0.0))], 0, 1)
         self._last: dict[int, Sequence[Pose]] = {}
 
     def render(self, poses: Sequence[Pose], first_row: int, row_step: int) -> None:
@@ -122,9 +129,35 @@ class Scene:
             return
         self._last[first_row] = poses
         view = self.picture[first_row::row_step]
-        view[:] = self._base[first_row::row_step]
-        for sheet in self._moving:
+        if self._shakes:
+            self._look_round(view, poses, first_row, row_step)
+        else:
+            view[:] = self._still[first_row::row_step]
+        for sheet in self._front:
             self._paint(view, sheet, poses, first_row, row_step)
+
+    def moments(self, travel_mm: float) -> int:
+        """Return how many moments of an exposure (Gauss-Legendre) stand for a travel, so that
+        the smear is right to some hundredths of a grey level."""
+        travel_blurs = travel_mm * self._px_per_mm / self._narrowest_px
+        return 1 if travel_blurs < 0.1 else 2 + math.floor(0.5 * travel_blurs)
+
+    def _look_round(
+        self, view: Greys, poses: Sequence[Pose], first_row: int, row_step: int
+    ) -> None:
+        """Fill in the laboratory as the shaking camera sees it, moved as a whole."""
+        shake_mm = np.array([pose.weight * np.array(pose.shake_mm) for pose in poses]).sum(axis=0)
+        homographies = [self.camera.homography(s) for s in ((0.0, 0.0), tuple(shake_mm))]
+        rest, now = (self.camera.project(h, np.zeros((1, 2)))[0] for h in homographies)
+        x, y = self._margin_px + rest - now
+        placed = np.array([[1.0, 0.0, x], [0.0, row_step, first_row + y]])
+        seen = cv2.warpAffine(
+            self._laboratory,
+            placed,
+            view.shape[::-1],
+            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        )
+        np.multiply(seen, self._light, out=view)
 
     def _hang(self, table: Table, shape: MarkerShape, at_mm: Floats, moves: bool) -> Sheet:
         left, bottom, right, top = sheet_mm(shape)
@@ -175,11 +208,11 @@ class Scene:
     def _paint(
         self, view: Greys, sheet: Sheet, poses: Sequence[Pose], first_row: int, row_step: int
     ) -> None:
-        traces = [self._trace(sheet, pose) for pose in poses]
+        traces = [(*self._trace(sheet, pose), pose.weight) for pose in poses]
         edges, circles = (
             [
-                self._lit(points[part], y_steps[part], view.shape, first_row, row_step)
-                for points, y_steps in traces
+                self._lit(points[part], y_steps[part], weight, view.shape, first_row, row_step)
+                for points, y_steps, weight in traces
                 for part in parts
             ]
             for parts in (sheet.parts[:EDGES], sheet.parts[EDGES:])
@@ -200,7 +233,13 @@ class Scene:
             view[top : top + height, left : left + width] += light * brightness
 
     def _lit(
-        self, points: Floats, y_steps: Floats, shape: tuple[int, int], first_row: int, row_step: int
+        self,
+        points: Floats,
+        y_steps: Floats,
+        weight: float,
+        shape: tuple[int, int],
+        first_row: int,
+        row_step: int,
     ) -> Lit:
         """Return what part of each pixel's light comes from the right of a piece of outline."""
         left, across = self._columns.at(points[:, 0])
@@ -220,13 +259,14 @@ class Scene:
             (down[:, :, None] * across[:, None, :]).ravel(),
             (height + 1) * (width + 1),
         ).reshape(height + 1, width + 1)
-        return Lit(row_0, column_0, np.cumsum(rise[:height, :width], axis=1))
+        light = weight * np.cumsum(rise[:height, :width], axis=1)
+        return Lit(row_0, column_0, np.asarray(light, dtype=np.float64))
 
     def _trace(self, sheet: Sheet, pose: Pose) -> tuple[Floats, Floats]:
         homography = self.camera.homography(pose.shake_mm)
         points_mm = sheet.points_mm + (pose.table_mm if sheet.moves else (0.0, 0.0))
         points, steps = self.camera.trace(homography, points_mm, sheet.steps_mm)
-        return points, pose.weight * steps[:, 1]
+        return points, steps[:, 1]
 
     def _chords(
         self, y: Floats, y_steps: Floats, first_row: int, row_step: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vdms_rt.capture.motion_path import MotionPath
+from vdms_rt.capture.motion_path import MotionPath, gauss_legendre
 from vdms_rt.capture.scene import Pose, Scene
 from vdms_rt.config import Table
 from vdms_rt.model import (
@@ -30,7 +31,8 @@ from vdms_rt.model import (
 Floats: TypeAlias = NDArray[np.float64]
 
 BUFFERS = 32
-"""Frames that wait for a late reader; the driver loses those after them."""
+"""Frames that wait for a late reader, as many as V4L2 can hold (VIDEO_MAX_FRAME); the driver loses
+those after them."""
 _SCANS = {
     "progressive": Scan.PROGRESSIVE,
     "top-first": Scan.TOP_FIRST,
@@ -70,16 +72,15 @@ class TableSource:
         self._path = MotionPath(config.motion, config.rest_s)
         self._scene = Scene(config, shapes, self._path.reach_mm)
         self._scan = _SCANS[config.scan]
-        self._period_ns = (
-            config.frame_rate_hz**-1 * 10**9 * (1 - Fraction(config.clock_error_ppm) / 10**6)
-        )
+        fast = Fraction(config.clock_error_ppm) / 10**6
+        self._period_ns: Fraction = (1 - fast) * 10**9 / config.frame_rate_hz
         self._start_ns = 0
         self._next_index = 0
         self._waiting: deque[int] = deque()
         self._delivered = 0
         self._rendered: tuple[int, list[Exposure]] | None = None
         self._frame: Luma = np.zeros((config.height_px, config.width_px), np.uint8)
-        self._noise = np.zeros(self._frame.shape, np.float32)
+        self._noise_of_bits = _normal_quantiles() * np.float32(config.noise_grey)
 
     @property
     def info(self) -> SourceInfo:
@@ -99,7 +100,9 @@ class TableSource:
             facts=(
                 ("distance_m", f"{c.distance_m:g}"),
                 ("angle_deg", f"{c.angle_deg:g}"),
+                ("px_per_mm", f"{self._scene.camera.scale:.4g}"),
                 ("motion", c.motion.kind),
+                ("sheets", ", ".join(sheet.marker for sheet in c.sheet)),
             ),
         )
 
@@ -108,7 +111,9 @@ class TableSource:
         if not self._start_ns:
             self._start_ns = time.monotonic_ns()
         if self._config.frames and self._delivered >= self._config.frames:
-            raise SourceEnded(f"the virtual table has given its {self._delivered} frames")
+            raise SourceEnded(
+                f"the virtual table has given its {self._delivered} frames of table.frames"
+            )
         index = self._oldest()
         if self._rendered is None or self._rendered[0] != index:
             self._rendered = (index, self._render(index))
@@ -133,13 +138,15 @@ class TableSource:
 
     def _oldest(self) -> int:
         """Return the frame to deliver next, after the driver has filled its buffers till now."""
+        late = self._config.pace == "realtime"
         now_ns = time.monotonic_ns()
-        live = self._config.pace == "realtime"
-        while not self._waiting or (live and self._end_ns(self._next_index) <= now_ns):
-            index = self._next_index
+        while not self._waiting or (late and self._end_ns(self._next_index) <= now_ns):
+            if len(self._waiting) == BUFFERS:
+                self._next_index = math.ceil((now_ns - self._start_ns) / self._period_ns) - 1
+                break
+            if self._luck(self._next_index)[0] >= self._config.lost_frames:
+                self._waiting.append(self._next_index)
             self._next_index += 1
-            if len(self._waiting) < BUFFERS and not self._luck(index)[0] < self._config.lost_frames:
-                self._waiting.append(index)
         return self._waiting[0]
 
     def _end_ns(self, index: int) -> int:
@@ -149,12 +156,10 @@ class TableSource:
         late_ms = self._luck(index)[1] * self._config.stamp_jitter_ms
         return self._end_ns(index) + round(late_ms * 1e6)
 
-    def _luck(self, index: int) -> Floats:
-        return self._random(0, index).random(2)
-
-    def _random(self, purpose: int, index: int) -> np.random.Generator:
-        seed = np.random.SeedSequence(self._config.seed, spawn_key=(purpose, index))
-        return np.random.Generator(np.random.SFC64(seed))
+    def _luck(self, index: int) -> tuple[float, float]:
+        """Return two random numbers in 0..1: does frame `index` arrive, and how late."""
+        first, second = _random(self._config.seed, 0, index).random_raw(2)
+        return float(first) / 2**64, float(second) / 2**64
 
     def _exposures(self, index: int) -> list[Exposure]:
         exposure_s = self._config.exposure_ms / 1000
@@ -174,37 +179,38 @@ class TableSource:
         exposures = self._exposures(index)
         for exposure in exposures:
             self._scene.render(self._poses(exposure), exposure.first_row, exposure.row_step)
-        self._random(1, index).standard_normal(dtype=np.float32, out=self._noise)
-        cv2.addWeighted(
-            self._scene.picture,
-            1.0,
-            self._noise,
-            self._config.noise_grey,
-            0.0,
-            dst=self._frame,
-            dtype=cv2.CV_8U,
-        )
+        if self._config.noise_grey > 0:
+            noise = cv2.LUT(self._bits(index), self._noise_of_bits)
+            cv2.add(self._scene.picture, noise, dst=self._frame, dtype=cv2.CV_8U)
+        else:
+            self._frame[:] = np.clip(np.rint(self._scene.picture), 0, 255)
         return exposures
+
+    def _bits(self, index: int) -> NDArray[np.uint16]:
+        """Return 16 random bits for each pixel."""
+        words = _random(self._config.seed, 1, index).random_raw(-(-self._frame.size // 4))
+        return words.view(np.uint16)[: self._frame.size].reshape(self._frame.shape)
 
     def _poses(self, exposure: Exposure) -> list[Pose]:
         """Return the moments whose weighted sum stands for the exposure (Gauss-Legendre)."""
-        span = np.linspace(exposure.begin_s, exposure.end_s, 9)
-        travel_mm = np.abs(np.diff(self._path.at(span) + self._shake_mm(span), axis=0)).sum()
-        smear_px = travel_mm * self._scene.camera.scale * max(1.0, self._config.pixel_aspect)
-        count = 1 if smear_px < 0.01 else 2 + math.ceil(smear_px / self._scene.blur_px)
-        nodes, weights = np.polynomial.legendre.leggauss(count)
-        half_s = (exposure.end_s - exposure.begin_s) / 2
-        times_s = exposure.middle_s + half_s * nodes
+        count = 1
+        if exposure.end_s > exposure.begin_s:
+            span_s = np.linspace(exposure.begin_s, exposure.end_s, 9)
+            steps_mm = np.diff(self._path.at(span_s) + self._shake_mm(span_s), axis=0)
+            count = self._scene.moments(float(np.abs(steps_mm).sum()))
+        nodes, weights = gauss_legendre(count)
+        times_s = exposure.middle_s + (exposure.end_s - exposure.begin_s) / 2 * nodes
+        at_mm, shake_mm = self._path.at(times_s), self._shake_mm(times_s)
         return [
-            Pose(float(w) / 2, (float(t[0]), float(t[1])), (float(s[0]), float(s[1])))
-            for w, t, s in zip(
-                weights, self._path.at(times_s), self._shake_mm(times_s), strict=True
-            )
+            Pose(float(w), (float(a[0]), float(a[1])), (float(s[0]), float(s[1])))
+            for w, a, s in zip(weights, at_mm, shake_mm, strict=True)
         ]
 
     def _shake_mm(self, times_s: Floats) -> Floats:
-        phase = 2 * np.pi * self._config.shake_hz * times_s
-        return self._config.shake_mm * np.stack([np.sin(phase), 0 * phase], axis=1)
+        """Return how far the plane's zero seems to move because the camera does, (n, 2)."""
+        cycles = self._config.shake_hz * np.maximum(times_s - self._config.rest_s, 0.0)
+        along = np.stack([np.sin(2 * np.pi * cycles), 0.5 * np.sin(3 * np.pi * cycles)], axis=1)
+        return np.asarray(self._config.shake_mm * along)
 
     def _tell(self, index: int, stamp_ns: int, exposures: list[Exposure]) -> None:
         middles = [e.middle_s for e in exposures]
@@ -232,3 +238,15 @@ class TableSource:
                         mean_y_mm=float(mean[1]) * sheet.moves,
                     )
                 )
+
+
+def _random(seed: int, purpose: int, index: int) -> np.random.SFC64:
+    return np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(purpose, index)))
+
+
+def _normal_quantiles() -> NDArray[np.float32]:
+    """Return what turns 16 even bits into the normal distribution, to 4.2 standard deviations,
+    (65536,); its own standard deviation is 1."""
+    inverse = statistics.NormalDist().inv_cdf
+    values = np.array([inverse((n + 0.5) / 65536) for n in range(65536)])
+    return np.asarray(values / values.std(), dtype=np.float32)
