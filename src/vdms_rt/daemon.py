@@ -44,7 +44,7 @@ SAMPLE_RATE_HZ = 60.0
 STATUS_LINE_S = 0.2
 RATE_WINDOW_S = 3.0
 DRAIN_S = 1.5
-"""For measuring what is in the ring; after that what has no room in the recorder's queue is lost."""
+"""For measuring what is in the ring; what then finds no room in the recorder's queue is lost."""
 JOIN_S = 2.5
 """A stop takes less than 3 s; a thread that has not ended by then hangs, and is named."""
 
