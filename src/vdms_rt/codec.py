@@ -6,6 +6,8 @@ the log's chunks compress them (docs/decisions/0001-region-pixels.md).
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -45,15 +47,19 @@ def decode_picture(data: bytes) -> tuple[Luma, bool] | None:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None:
         return None
-    exact = image.ndim == 2 and image.dtype == np.uint8
+    if image.dtype not in (np.uint8, np.uint16):
+        return None
+    return luma(image), image.ndim == 2 and image.dtype == np.uint8
+
+
+def luma(image: NDArray[Any]) -> Luma:
+    """Return the luma (height, width) of a grey or blue-green-red(-alpha) image of 8 or 16 bits."""
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    if image.dtype != np.uint8:
-        return None
     if image.ndim == 3:
         from_colour = cv2.COLOR_BGRA2GRAY if image.shape[2] == 4 else cv2.COLOR_BGR2GRAY
         image = cv2.cvtColor(image, from_colour)
-    return np.asarray(image, np.uint8), exact
+    return np.asarray(image, np.uint8)
 
 
 def _encoded(suffix: str, image: NDArray[np.uint8], settings: list[int]) -> bytes:
