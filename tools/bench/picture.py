@@ -1,0 +1,282 @@
+"""Pictures for the accuracy benches, made by nothing that measures them.
+
+The marker: discs of radius 25 mm at (+-60, +-60) mm on a sheet of 200 mm, which fills 65 % of 480
+rows whatever the distance. A pinhole camera sees it under an angle about the vertical. Each pixel
+is the exact integral of the disc's picture over its own area, after a Gaussian blur: the circle's
+image is a conic, its chord along a row is integrated in closed form, and across the rows by a
+quadrature that converges geometrically (the chord's ends are smooth in the parametric angle).
+
+Coordinates are those of the product: pixels from the centre of the top-left one, x right, y down;
+millimetres in the marker plane, x right, y up; rotation counter-clockwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from math import ceil, cos, erf, exp, floor, pi, radians, sin, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+Grey = NDArray[np.float64]
+
+DISTANCES_M = (4.0, 8.0, 12.0, 16.0, 20.0)
+ANGLES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
+DISTURBANCES = ("glare", "specks", "wire", "shadow", "gradient", "cut")
+
+_REACH = 7.0
+"""Standard deviations after which a Gaussian is nothing (3e-12)."""
+_STEP = 1 / 128
+_U = np.arange(-_REACH, _REACH + 1.5 * _STEP, _STEP)
+_PHI = np.array([0.5 * (1 + erf(u / sqrt(2))) for u in _U])
+_RAMP = _U * _PHI + np.array([exp(-u * u / 2) / sqrt(2 * pi) for u in _U])
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The camera, the marker and their light."""
+
+    distance_m: float = 8.0
+    angle_deg: float = 0.0
+    roll_deg: float = 0.0
+    width_px: int = 720
+    height_px: int = 480
+    pixel_aspect: float = 1.1
+    fill: float = 0.65
+    sheet_mm: float = 200.0
+    half_spacing_mm: float = 60.0
+    radius_mm: float = 25.0
+    black_grey: float = 30.0
+    white_grey: float = 200.0
+    blur_x_px: float = 0.85
+    blur_y_px: float = 0.6
+
+    @property
+    def circles_mm(self) -> NDArray[np.float64]:
+        """Top left, top right, bottom left, bottom right."""
+        h = self.half_spacing_mm
+        return np.array([(-h, h), (h, h), (-h, -h), (h, -h)])
+
+    @property
+    def homography(self) -> NDArray[np.float64]:
+        """Marker plane in millimetres -> pixels, (3, 3), for the marker at rest."""
+        distance_mm = self.distance_m * 1000
+        focal = self.fill * self.height_px * distance_mm / self.sheet_mm
+        turn, roll = radians(self.angle_deg), radians(self.roll_deg)
+        pose = np.array([[cos(turn), 0, 0], [0, 1, 0], [sin(turn), 0, distance_mm]])
+        rolled = np.array([[cos(roll), -sin(roll), 0], [sin(roll), cos(roll), 0], [0, 0, 1]])
+        lens = np.array(
+            [
+                [focal * self.pixel_aspect, 0, (self.width_px - 1) / 2],
+                [0, -focal, (self.height_px - 1) / 2],
+                [0, 0, 1],
+            ]
+        )
+        return lens @ rolled @ pose
+
+    def moved(self, x_mm: float, y_mm: float, rotation_mrad: float) -> NDArray[np.float64]:
+        c, s = cos(rotation_mrad / 1000), sin(rotation_mrad / 1000)
+        return self.homography @ np.array([[c, -s, x_mm], [s, c, y_mm], [0, 0, 1]])
+
+    def centres_px(
+        self, x_mm: float = 0.0, y_mm: float = 0.0, rotation_mrad: float = 0.0
+    ) -> NDArray[np.float64]:
+        """Centres of the ellipses (not the pictures of the circles' centres), (4, 2)."""
+        h = self.moved(x_mm, y_mm, rotation_mrad)
+        return np.array([_Ellipse.of(h, c, self.radius_mm).centre for c in self.circles_mm])
+
+    def cover(
+        self, x_mm: float = 0.0, y_mm: float = 0.0, rotation_mrad: float = 0.0
+    ) -> NDArray[np.float64]:
+        """The part of each pixel's light that comes from white, (height, width), blur included."""
+        out = np.zeros((self.height_px, self.width_px))
+        h = self.moved(x_mm, y_mm, rotation_mrad)
+        for circle in self.circles_mm:
+            _Ellipse.of(h, circle, self.radius_mm).add(out, self.blur_x_px, self.blur_y_px)
+        return out
+
+    def still(self, x_mm: float = 0.0, y_mm: float = 0.0, rotation_mrad: float = 0.0) -> Grey:
+        """The picture without noise, in grey levels, (height, width)."""
+        return self.black_grey + (self.white_grey - self.black_grey) * self.cover(
+            x_mm, y_mm, rotation_mrad
+        )
+
+    def exposed(self, poses: NDArray[np.float64], weights: NDArray[np.float64]) -> Grey:
+        """The mean picture of poses (n, 3) in x_mm, y_mm, rotation_mrad with weights (n,)."""
+        return sum(
+            (w * self.still(*pose) for pose, w in zip(poses, weights, strict=True)),
+            np.zeros((self.height_px, self.width_px)),
+        )
+
+
+def exposure_nodes(exposure_s: float, count: int = 8) -> tuple[Grey, Grey]:
+    """Times about the middle of an exposure and their weights (Gauss-Legendre), each (count,)."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return nodes * exposure_s / 2, weights / 2
+
+
+def grabbed(clean: Grey, noise_grey: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The 8-bit picture of `clean` with white noise of that standard deviation."""
+    noisy = clean + noise_grey * rng.standard_normal(clean.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def woven(first: Grey, second: Grey, bottom_first: bool = True) -> Grey:
+    """An interlaced frame of two pictures: rows 1, 3, ... of the earlier and 0, 2, ... of the
+    later one, or the other way round."""
+    top, bottom = (second, first) if bottom_first else (first, second)
+    frame = top.copy()
+    frame[1::2] = bottom[1::2]
+    return frame
+
+
+def disturbed(
+    clean: Grey, bench: Bench, kind: str, circles: tuple[int, ...], rng: np.random.Generator
+) -> Grey:
+    """`clean` with a disturbance of `kind` on each of `circles`, drawn from `rng`.
+
+    glare: a bright spot near the edge. specks: two to five black or white dots of dirt near the
+    edge. wire: a dark or bright line across the disc. shadow: half of the disc in 30..80 % of the
+    light. gradient: light that changes by 5..30 % from the disc's centre to its edge, alike on all
+    `circles`. cut: 20 % of the disc covered by black.
+    """
+    y, x = np.mgrid[0 : bench.height_px, 0 : bench.width_px].astype(np.float64)
+    out = clean.copy()
+    slope, heading = rng.uniform(0.05, 0.3), rng.uniform(0, 2 * pi)
+    for i in circles:
+        ellipse = _Ellipse.of(bench.homography, bench.circles_mm[i], bench.radius_mm)
+        # In these coordinates the disc is the unit circle.
+        v = (y - ellipse.centre[1]) / ellipse.half_height
+        u = (x - ellipse.centre[0] - ellipse.lean * (y - ellipse.centre[1])) / ellipse.half_chord
+        pixel = 1 / sqrt(ellipse.half_height * ellipse.half_chord)
+        at = rng.uniform(0, 2 * pi)
+        across = u * cos(at) + v * sin(at)
+        match kind:
+            case "glare":
+                r, size = rng.uniform(0.6, 1.1), rng.uniform(0.1, 0.4)
+                spot = (u - r * cos(at)) ** 2 + (v - r * sin(at)) ** 2
+                out += rng.uniform(60, 300) * np.exp(-spot / (2 * size * size))
+            case "specks":
+                for _ in range(rng.integers(2, 6)):
+                    at, r = rng.uniform(0, 2 * pi), rng.uniform(0.8, 1.1)
+                    level = bench.black_grey if rng.random() < 0.5 else bench.white_grey
+                    spot = np.hypot(u - r * cos(at), v - r * sin(at))
+                    out += (level - out) * _soft(rng.uniform(0.05, 0.15) - spot, pixel)
+            case "wire":
+                off, width = rng.uniform(-0.8, 0.8), rng.uniform(1.0, 5.0) * pixel
+                level = rng.choice([bench.black_grey, 0.5 * bench.white_grey, bench.white_grey])
+                out += (level - out) * _soft(width / 2 - abs(across - off), pixel)
+            case "shadow":
+                lit = _soft(across - rng.uniform(-0.6, 0.6), pixel * rng.uniform(1, 6))
+                inside = np.hypot(u, v) < 1.6
+                out *= np.where(inside, 1 - rng.uniform(0.2, 0.7) * (1 - lit), 1)
+            case "gradient":
+                inside = np.maximum(abs(u), abs(v)) < 1.6
+                out *= np.where(inside, 1 + slope * (u * cos(heading) + v * sin(heading)), 1)
+            case "cut":
+                # The chord that cuts off 20 % of a circle lies at 0.4920 of its radius.
+                out += (bench.black_grey - out) * _soft(across - 0.4920, pixel)
+            case _:
+                raise ValueError(f"no disturbance is called {kind}; known: {DISTURBANCES}")
+    return out
+
+
+def _soft(inside: Grey, width: float) -> Grey:
+    """0 to 1 where `inside` goes from below to above 0, over about `width`."""
+    return 0.5 + 0.5 * np.tanh(np.clip(inside / width, -20, 20))
+
+
+@dataclass(frozen=True)
+class _Ellipse:
+    centre: NDArray[np.float64]
+    half_height: float
+    """Rows from the centre to the top."""
+    half_chord: float
+    """Half the length of the chord along the row of the centre."""
+    lean: float
+    """Pixels by which the chords' middles move to the right for each row down."""
+
+    @staticmethod
+    def of(
+        homography: NDArray[np.float64], centre_mm: NDArray[np.float64], radius_mm: float
+    ) -> _Ellipse:
+        x, y = centre_mm
+        circle = np.array([[1, 0, -x], [0, 1, -y], [-x, -y, x * x + y * y - radius_mm**2]])
+        back = np.linalg.inv(homography)
+        conic = back.T @ circle @ back
+        (a, b), (_, c) = conic[:2, :2]
+        centre = np.linalg.solve(conic[:2, :2], -conic[:2, 2])
+        level = -(conic[2, 2] + conic[2, :2] @ centre)
+        return _Ellipse(
+            centre,
+            half_height=sqrt(level * a / (a * c - b * b)),
+            half_chord=sqrt(level / a),
+            lean=-b / a,
+        )
+
+    def add(self, out: Grey, blur_x_px: float, blur_y_px: float) -> None:
+        cx, cy = self.centre
+        # A third of the blur from node to node leaves an error of exp(-2 pi^2 9).
+        nodes = ceil(pi * self.half_height / (min(blur_y_px, 1.0) / 3)) + 8
+        t = pi * ((np.arange(nodes) + 0.5) / nodes - 0.5)
+        drop = self.half_height * np.sin(t)
+        weight = self.half_height * np.cos(t) * pi / nodes
+        middle = cx + self.lean * drop
+        half = self.half_chord * np.cos(t)
+        reach_y = self.half_height + _REACH * blur_y_px + 1
+        reach_x = self.half_chord + abs(self.lean) * self.half_height + _REACH * blur_x_px + 1
+        rows = np.arange(max(0, floor(cy - reach_y)), min(len(out), ceil(cy + reach_y) + 1))
+        columns = np.arange(max(0, floor(cx - reach_x)), min(out.shape[1], ceil(cx + reach_x) + 1))
+        if not len(rows) or not len(columns):
+            return
+        row_edges = np.append(rows, rows[-1] + 1) - 0.5
+        column_edges = np.append(columns, columns[-1] + 1) - 0.5
+        below = _table(_PHI, (row_edges[:, None] - (cy + drop)) / blur_y_px, 0.0)
+        along = blur_x_px * (
+            _table(_RAMP, (column_edges - (middle - half)[:, None]) / blur_x_px, 1.0)
+            - _table(_RAMP, (column_edges - (middle + half)[:, None]) / blur_x_px, 1.0)
+        )
+        out[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += (
+            np.diff(below, axis=0) * weight
+        ) @ np.diff(along, axis=1)
+
+
+def _table(values: Grey, u: Grey, slope_beyond: float) -> Grey:
+    """`values` over `_U` at u, by cubic interpolation; beyond the right end they rise by
+    `slope_beyond`, beyond the left end they are 0."""
+    at = np.clip((u + _REACH) / _STEP, 1, len(_U) - 3)
+    i = at.astype(np.int64)
+    f = at - i
+    p0, p1, p2, p3 = values[i - 1], values[i], values[i + 1], values[i + 2]
+    cubic = p1 + f * (
+        (p2 - p0) / 2
+        + f * (p0 - 2.5 * p1 + 2 * p2 - p3 / 2 + f * ((p3 - p0) / 2 + 1.5 * (p1 - p2)))
+    )
+    return cubic + slope_beyond * np.maximum(u - _U[-3], 0)
+
+
+def main() -> None:
+    import cv2
+
+    parser = argparse.ArgumentParser(prog="python -m tools.bench.picture", description=__doc__)
+    parser.add_argument("--out", default="bench.png", help="PNG to write")
+    parser.add_argument("--distance-m", type=float, default=8.0)
+    parser.add_argument("--angle-deg", type=float, default=0.0)
+    parser.add_argument("--roll-deg", type=float, default=0.0)
+    parser.add_argument("--noise-grey", type=float, default=2.0)
+    parser.add_argument("--x-mm", type=float, default=0.0)
+    parser.add_argument("--disturb", choices=DISTURBANCES, help="on the first disc")
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    bench = Bench(distance_m=args.distance_m, angle_deg=args.angle_deg, roll_deg=args.roll_deg)
+    rng = np.random.default_rng(args.seed)
+    clean = bench.still(args.x_mm)
+    if args.disturb:
+        clean = disturbed(clean, bench, args.disturb, (0,), rng)
+    cv2.imwrite(args.out, grabbed(clean, args.noise_grey, rng))
+    print(args.out)
+
+
+if __name__ == "__main__":
+    main()
