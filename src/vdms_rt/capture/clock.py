@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections import deque
 from dataclasses import dataclass
+from fractions import Fraction
 
+from vdms_rt.capture.cadence import INTERVALS, Cadence, Pace
 from vdms_rt.capture.line import StampLine
 from vdms_rt.capture.utc import UtcOffset
 from vdms_rt.model import Event, Scan, Severity, SourceInfo, StampEvent, Tick
 
 UTC_SAMPLE_NS = 1_000_000_000
 STALL_NS = 2_000_000_000
-"""After so long without a frame the source's phase is not taken for granted."""
-EARLY = 0.25
-"""Part of a period by which a stamp may be earlier than foreseen; it may be late by the rest."""
+"""After so long without an image the source's phase is not taken for granted."""
+LATE_RUN = 12
+"""Images in a row that are all later than any should be: the source's phase has moved. Load holds
+up two or three."""
+EARLY_RUN = 3
+"""Images among the last eight that are earlier than any can be."""
+DISTRUST = 8
+"""Images in a row after which the interval is believed and not a sequence that saw no loss."""
+RATE_LIMIT = 400e-6
+"""No quartz is off by more: the source runs at another rate than it says."""
+RATE_SURE = 900
+"""Stamps after which the rate is known well enough for that."""
+SHIFT_NS = 300_000
+"""A grid that moves by more has a new segment."""
+FREE_SIGMA_NS = 3_000_000
+"""Of one stamp by itself, which may be late by a few milliseconds."""
 RECORDED = ("clip", "log")
 """Kinds of sources whose stamps are mid-exposure times already, and exact."""
 
@@ -27,38 +44,44 @@ class ClockFigures:
     sigma_us: float
     """Of the latest time, a constant delay aside."""
     rate_ppm: float
-    """Positive when frames come fast."""
+    """Of the source against the computer's clock; positive when frames come fast."""
     missed: int
-    """Frame periods without a frame."""
+    """Images that never came: frames, or fields of a source that alternates."""
     segments: int
+    settling: bool
+    """Too few stamps so far for times at their best."""
     utc_state: str
+    """`synchronised`, `not synchronised` or `unknown`."""
 
 
 def mid_exposure_ns(info: SourceInfo, exposure_ns: int, chain_delay_ns: int, scan: Scan) -> int:
-    """Return what is added to a stamp's true moment to get the middle of the exposure.
+    """Return what is added to the undelayed stamp of an image to get the middle of its exposure.
 
-    A field's readout takes half a period T and starts as its exposure e ends. So an interlaced
-    frame, whose two fields lie T/4 before and after its middle, ends 3T/4 + e/2 after it, a
-    progressive one T + e/2, a single field T/2 + e/2.
+    A field's readout takes half the frame period T and starts as its exposure e ends. So an
+    interlaced frame, whose two fields lie T/4 before and after its middle, ends 3T/4 + e/2 after
+    it, a progressive one T + e/2, a single field T/2 + e/2. `exposure_ns` holds where the source
+    does not know its own.
     """
     exposure_ns = exposure_ns if info.exposure_ns is None else info.exposure_ns
     quarter_ns = info.frame_period_s * 10**9 / 4
-    quarters = 3 if scan.interlaced else 4 if scan is Scan.PROGRESSIVE else 2
     match info.stamp_event:
         case StampEvent.END_OF_FRAME:
+            quarters = 3 if scan.interlaced else 4 if scan is Scan.PROGRESSIVE else 2
             return round(-quarters * quarter_ns) - exposure_ns // 2 - chain_delay_ns
         case StampEvent.START_OF_EXPOSURE:
-            first_to_middle = 1 if scan.interlaced else 0
-            return round(first_to_middle * quarter_ns) + exposure_ns // 2 - chain_delay_ns
+            quarters = 1 if scan.interlaced else 0
+            return round(quarters * quarter_ns) + exposure_ns // 2 - chain_delay_ns
         case StampEvent.MID_EXPOSURE:
             return -chain_delay_ns
 
 
 class FrameClock:
-    """Index and mid-exposure time of each frame of one source. Used by the capture thread alone.
+    """Index and mid-exposure time of each image of a source. Used by the capture thread alone.
 
-    With a source of alternating fields every buffer ticks: the two fields of a frame get the same
-    index and times half a period apart.
+    Images are frames, or with a source of alternating fields (`SourceInfo.scan` TOP) fields: the
+    two of a frame get the same index and times half a period apart. An image's place on the grid
+    is found from its stamp, as most drivers leave no gap in their sequence where they lose a frame.
+    A recording's stamps are its times, untouched.
     """
 
     def __init__(
@@ -71,44 +94,62 @@ class FrameClock:
         """`exposure_ns` holds where the source does not know its own; `chain_delay_ns` is taken
         off every time but a recording's."""
         self._info = info
-        self._per_frame = 2 if info.scan in (Scan.TOP, Scan.BOTTOM) else 1
         self._exact = info.kind in RECORDED
-        self._period_ns = info.frame_period_s * 10**9 / self._per_frame
-        self._delays = {
-            scan: 0 if self._exact else mid_exposure_ns(info, exposure_ns, chain_delay_ns, scan)
-            for scan in Scan
-        }
+        self._fields = 2 if info.scan in (Scan.TOP, Scan.BOTTOM) else 1
+        self._exposure_ns, self._chain_delay_ns = exposure_ns, chain_delay_ns
         self._utc = (utc or UtcOffset()) if info.live else None
-        self._utc_due_ns = 0
-        self._line = StampLine(self._period_ns)
-        self._slot = -1
+        self._utc_due_ns: int | None = None
+        self._slept = False
+        self._set_period(info.frame_period_s * 10**9 / self._fields)
+        self._slot: int | None = None
+        """Place of the latest image on the grid of the line."""
+        self._shift = 0
+        """Added to a slot it gives the place that was told."""
         self._stamp_ns = 0
         self._sequence = 0
+        self._scan = info.scan
         self._first_scan: Scan | None = None
+        self._free = False
+        """Images come unevenly: there is no grid."""
+        self._just_missed = 0
+        self._calls, self._taken_back = 0, 0
+        """How often images were called missed, and how often in error."""
+        self._lately_missed: deque[int] = deque(maxlen=INTERVALS)
+        self._doubts = 0
+        self._recent: deque[tuple[int, int, bool]] = deque(maxlen=LATE_RUN)
+        """Slot and stamp of the latest images, and whether they came earlier than they can."""
+        self._late_run = 0
+        self._doubt_ns = 0.0
         self._segment = 0
         self._missed = 0
         self._sigma_ns = 0.0
         self._events: list[Event] = []
 
     def tick(self, stamp_ns: int, sequence: int, scan: Scan | None = None) -> Tick:
-        """Return when the frame with this stamp was; call it once for every image delivered.
+        """Return when the image with this stamp was; call it once for every one delivered.
 
-        `scan` tells which field an image of alternating fields is.
+        `scan` tells which field an image of alternating fields is. Costs some microseconds.
         """
         scan = self._info.scan if scan is None else scan
-        if stamp_ns >= self._utc_due_ns:
+        if self._utc_due_ns is None or stamp_ns >= self._utc_due_ns:
             self.sample_utc()
             self._utc_due_ns = stamp_ns + UTC_SAMPLE_NS
-        if self._slot < 0:
+        if self._slot is None:
             self._slot = 0
             self._line.begin(0, stamp_ns)
         else:
-            self._advance(stamp_ns, sequence)
-        self._stamp_ns, self._sequence = stamp_ns, sequence
-        t_ns = stamp_ns if self._exact else self._line.at(self._slot) + self._delays[scan]
-        self._sigma_ns = 0.0 if self._exact else self._line.sigma_ns(self._slot)
+            before, self._slot = self._slot, self._advance(self._slot, stamp_ns, sequence, scan)
+            self._pair(before, self._slot, sequence, scan)
+        self._stamp_ns, self._sequence, self._scan = stamp_ns, sequence, scan
+        if self._exact:
+            t_ns, self._sigma_ns = stamp_ns, 0.0
+        elif self._free:
+            t_ns, self._sigma_ns = stamp_ns + self._delays_ns[scan], FREE_SIGMA_NS
+        else:
+            t_ns = self._line.at(self._slot) + self._delays_ns[scan]
+            self._sigma_ns = math.hypot(self._line.sigma_ns(self._slot), self._doubt_ns)
         return Tick(
-            index=self._slot // self._per_frame,
+            index=(self._slot + self._shift) // self._fields,
             t_ns=t_ns,
             sigma_t_ns=math.ceil(self._sigma_ns),
             segment=self._segment,
@@ -118,7 +159,8 @@ class FrameClock:
     def sample_utc(self) -> None:
         """Read the UTC clock; `tick` does it once a second."""
         if self._utc:
-            _, events = self._utc.sample()
+            slept, events = self._utc.sample()
+            self._slept = self._slept or slept
             self._events += events
 
     def take_events(self) -> list[Event]:
@@ -127,49 +169,240 @@ class FrameClock:
         return events
 
     @property
+    def period_ns(self) -> Fraction:
+        """Of a frame: what the source said, or what its stamps have shown instead."""
+        return self._period_ns * self._fields
+
+    @property
     def figures(self) -> ClockFigures:
         return ClockFigures(
             jitter_us=0.0 if self._exact else self._line.jitter_ns / 1e3,
             sigma_us=self._sigma_ns / 1e3,
-            rate_ppm=self._line.rate * 1e6,
+            rate_ppm=0.0 if self._exact else self._line.rate * 1e6,
             missed=self._missed,
             segments=self._segment + 1,
+            settling=not self._exact and (self._free or not self._line.settled),
             utc_state=self._utc.state if self._utc else "unknown",
         )
 
-    def _advance(self, stamp_ns: int, sequence: int) -> None:
-        if stamp_ns < self._stamp_ns or stamp_ns - self._stamp_ns > STALL_NS:
-            self._break(stamp_ns)
-            return
-        late_ns = stamp_ns - self._line.at(self._slot + 1)
-        lost = max(0, math.floor(late_ns / self._period_ns + EARLY))
-        if self._info.sequence_counts_lost and not self._exact and self._per_frame == 1:
-            lost = max(0, sequence - self._sequence - 1)
-        if lost and not self._exact:
-            self._miss(lost, stamp_ns)
-        self._slot += 1 + lost
-        self._line.add(self._slot, stamp_ns)
+    def _advance(self, slot: int, stamp_ns: int, sequence: int, scan: Scan) -> int:
+        """Return the slot of the next image."""
+        gap_ns = stamp_ns - self._stamp_ns
+        step = (sequence - self._sequence + 2**31) % 2**32 - 2**31
+        if self._exact:
+            if gap_ns <= 0:
+                self._segment += 1
+            return slot + max(1, round(gap_ns / self._period_ns))
+        broken = self._broken(gap_ns, step)
+        if broken:
+            skipped = max(0, round(gap_ns / self._period_ns) - 1)
+            self._miss(slot, skipped)
+            slot += 1 + skipped
+            self._restart([(slot, stamp_ns)], broken)
+            return slot
+        if self._cadence.add(gap_ns, step):
+            pace, period_ns = self._cadence.judge()
+            if pace is not (Pace.UNEVEN if self._free else Pace.AS_SAID):
+                self._change_pace(slot + 1, stamp_ns, pace, period_ns)
+                return slot + 1
+        if self._free:
+            skipped = step - 1 if self._counts_lost else round(gap_ns / self._period_ns) - 1
+            self._miss(slot, max(0, skipped))
+            return slot + 1 + max(0, skipped)
+        return self._place(slot, stamp_ns, gap_ns, step, scan)
 
-    def _miss(self, lost: int, stamp_ns: int) -> None:
-        self._missed += lost
-        self._event(
+    def _broken(self, gap_ns: int, step: int) -> str:
+        """Return why nothing follows from the stamps before; empty if something does."""
+        slept, self._slept = self._slept, False
+        if slept:
+            return "the computer slept"
+        if gap_ns < 0:
+            return f"the driver's stamps went back by {-gap_ns / 1e9:.3f} s"
+        if step < 0:
+            return "the driver began to count anew"
+        if gap_ns > STALL_NS:
+            return f"nothing came for {gap_ns / 1e9:.1f} s"
+        return ""
+
+    def _place(self, slot: int, stamp_ns: int, gap_ns: int, step: int, scan: Scan) -> int:
+        """Return the slot of an image on the grid, and count those missed before it."""
+        line, period = self._line, float(self._period_ns)
+        early_ns = line.early_limit_ns
+        late_ns = stamp_ns - line.at(slot + 1)
+        if late_ns < -early_ns and self._just_missed:
+            slot = self._take_back(slot, stamp_ns)
+            late_ns = stamp_ns - line.at(slot + 1)
+        # Images that were held up come one upon the other, and nothing is missing between them.
+        close = gap_ns < period - early_ns
+        missed = 0 if close else max(0, math.floor((late_ns + early_ns) / period))
+        if self._counts_lost and step > 0:
+            missed = self._believe(missed, step - 1)
+        missed = self._on_its_turn(slot, missed, scan)
+        self._just_missed = missed
+        self._calls += missed > 0
+        self._miss(slot, missed)
+        slot += 1 + missed
+        late_ns = stamp_ns - line.at(slot)
+        if self._moved(slot, stamp_ns, late_ns, early_ns):
+            return slot
+        if abs(late_ns) < period:
+            moved_ns = line.add(slot, stamp_ns)
+            if abs(moved_ns) > SHIFT_NS:
+                self._jump(f"they moved by {moved_ns / 1e6:+.1f} ms against the stamps before")
+        if not self._rate_told and line.count >= RATE_SURE and abs(line.rate) > RATE_LIMIT:
+            self._tell_rate(line.rate)
+        return slot
+
+    @property
+    def _counts_lost(self) -> bool:
+        return self._info.sequence_counts_lost and self._fields == 1
+
+    def _believe(self, by_time: int, by_sequence: int) -> int:
+        """Return how many images are missing where the sequence should know."""
+        if by_sequence >= by_time:
+            self._doubts = 0
+            # A stamp may be late but not early: more do not fit into the interval.
+            return by_time if self._line.settled else by_sequence
+        self._doubts += 1
+        if self._doubts < DISTRUST:
+            return by_sequence
+        self._doubts = 0
+        return by_time
+
+    def _on_its_turn(self, slot: int, missed: int, scan: Scan) -> int:
+        """Return the number missed with which an alternating field comes in its turn."""
+        if self._first_scan is None:
+            return missed
+        second = scan is not self._first_scan
+        if (slot + 1 + missed + self._shift) % 2 == second:
+            return missed
+        return missed - 1 if missed else 1
+
+    def _pair(self, before: int, slot: int, sequence: int, scan: Scan) -> None:
+        """Learn which field begins a frame: the two of one frame share a sequence number."""
+        if self._fields == 1 or self._first_scan is not None:
+            return
+        if slot == before + 1 and scan is not self._scan:
+            paired = sequence == self._sequence
+            self._first_scan = self._scan if paired else scan
+            self._shift += ((before if paired else slot) + self._shift) % 2
+
+    def _moved(self, slot: int, stamp_ns: int, late_ns: int, early_ns: float) -> bool:
+        """Look whether the source's phase has changed, and begin anew if so."""
+        self._recent.append((slot, stamp_ns, late_ns < -early_ns))
+        # What is called missed was sometimes only held up.
+        error_ns = self._just_missed * float(self._period_ns)
+        self._doubt_ns = error_ns * math.sqrt(self._taken_back / (self._calls + 1))
+        if not self._line.settled:
+            return False
+        if late_ns < -early_ns:
+            self._doubt_ns = float(-late_ns)
+            last = list(self._recent)[-8:]
+            while not last[0][2]:
+                del last[0]
+            if sum(early for _, _, early in last) < EARLY_RUN:
+                return False
+        elif late_ns > self._line.late_limit_ns:
+            self._late_run += 1
+            if self._late_run > 2:
+                self._doubt_ns = float(late_ns)
+            if self._late_run < LATE_RUN:
+                return False
+            last = list(self._recent)
+        else:
+            self._late_run = 0
+            return False
+        self._restart([(s, t) for s, t, _ in last], f"the source moved by {late_ns / 1e6:+.1f} ms")
+        return True
+
+    def _restart(self, images: list[tuple[int, int]], why: str) -> None:
+        """Begin a segment with slots and stamps that belong together."""
+        self._line.begin(*images[0])
+        for slot, stamp_ns in images[1:]:
+            self._line.add(slot, stamp_ns)
+        self._late_run, self._doubts, self._just_missed, self._doubt_ns = 0, 0, 0, 0.0
+        self._recent.clear()
+        self._jump(why)
+
+    def _change_pace(self, slot: int, stamp_ns: int, pace: Pace, period_ns: Fraction) -> None:
+        """Go on at another period, or without one."""
+        said_hz = float(10**9 / self._period_ns)
+        self._free = pace is Pace.UNEVEN
+        if pace is Pace.OTHER:
+            self._missed -= sum(self._lately_missed)
+            why = (
+                f"images come at {float(10**9 / period_ns):.3f} Hz and not at {said_hz:.3f} Hz; "
+                "look whether the camera's standard and rate are those of the configuration"
+            )
+        elif self._free:
+            why = "images come at uneven intervals; each has its own stamp's time"
+        else:
+            why = f"images come at an even {said_hz:.3f} Hz again"
+        self._set_period(period_ns)
+        self._restart([(slot, stamp_ns)], why)
+
+    def _set_period(self, period_ns: Fraction) -> None:
+        self._period_ns = period_ns
+        self._info = dataclasses.replace(
+            self._info, frame_period_s=period_ns * self._fields / 10**9
+        )
+        self._delays_ns = {
+            scan: mid_exposure_ns(self._info, self._exposure_ns, self._chain_delay_ns, scan)
+            for scan in Scan
+        }
+        self._line = StampLine(period_ns)
+        analogue = self._info.scan is not Scan.PROGRESSIVE
+        self._cadence = Cadence(period_ns, self._fields, analogue, self._info.sequence_counts_lost)
+        self._rate_told = False
+
+    def _miss(self, slot: int, missed: int) -> None:
+        self._lately_missed.append(missed)
+        if not missed:
+            return
+        self._missed += missed
+        what = "frame" if self._fields == 1 else "field"
+        self._tell(
             Severity.WARNING,
             "frames-missed",
-            f"{lost} frame{'s' if lost > 1 else ''} missed after frame "
-            f"{self._slot // self._per_frame}.",
-            stamp_ns,
+            f"{missed} {what}{'s' if missed > 1 else ''} missed after frame "
+            f"{(slot + self._shift) // self._fields}",
+            (("missed", str(missed)), ("total", str(self._missed))),
         )
 
-    def _break(self, stamp_ns: int) -> None:
-        gap_ns = stamp_ns - self._stamp_ns
+    def _take_back(self, slot: int, stamp_ns: int) -> int:
+        """Undo the last call of images missed: they were held up and come now."""
+        missed = self._just_missed
+        self._taken_back += 1
+        self._missed -= missed
+        self._shift += missed
+        self._just_missed = 0
+        held_ms = (stamp_ns - self._line.at(slot - missed)) / 1e6
+        self._jump(f"the last {missed} called missed came after all, held up for {held_ms:.0f} ms")
+        return slot - missed
+
+    def _jump(self, why: str) -> None:
         self._segment += 1
-        self._slot += max(1, round(gap_ns / self._period_ns))
-        self._line.begin(self._slot, stamp_ns)
-        how = f"a pause of {gap_ns / 1e9:.3f} s" if gap_ns > 0 else "stamps that went back"
-        self._event(
-            Severity.WARNING, "clock-jump", f"Frame times start anew after {how}.", stamp_ns
+        self._tell(
+            Severity.WARNING,
+            "clock-jump",
+            f"frame times begin segment {self._segment}: {why}",
+            (("segment", str(self._segment)),),
         )
 
-    def _event(self, severity: Severity, code: str, text: str, t_ns: int) -> None:
+    def _tell_rate(self, rate: float) -> None:
+        self._rate_told = True
+        said_hz = float(10**9 / self._period_ns)
+        self._tell(
+            Severity.WARNING,
+            "clock-rate",
+            f"images come at {said_hz * (1 + rate):.4f} Hz, {rate * 1e6:+.0f} ppm off "
+            f"{said_hz:.4f} Hz, which is more than quartz is off; look at the camera's rate",
+            (("rate_ppm", f"{rate * 1e6:.1f}"),),
+        )
+
+    def _tell(
+        self, severity: Severity, code: str, text: str, facts: tuple[tuple[str, str], ...]
+    ) -> None:
+        t_ns = self._stamp_ns
         utc_ns = t_ns + self._utc.offset_ns if self._utc else 0
-        self._events.append(Event(severity, code, text, t_ns, utc_ns))
+        self._events.append(Event(severity, code, text, t_ns, utc_ns, facts))
