@@ -25,6 +25,7 @@ class Backlog:
 
     def __init__(self, limit_messages: int, live: bool) -> None:
         self._limit_messages = limit_messages
+        self._worth_waking = min(BATCH_MESSAGES, limit_messages // 2)
         self._lock = threading.Lock()
         self._ready = threading.Condition(self._lock)
         self._room = threading.Condition(self._lock)
@@ -102,7 +103,7 @@ class Backlog:
         """Return when a batch is there, when `end` was called, or after `timeout_s`."""
         with self._lock:
             self._ready.wait_for(
-                lambda: self._ended or len(self._items) >= BATCH_MESSAGES, timeout_s
+                lambda: self._ended or len(self._items) >= self._worth_waking, timeout_s
             )
 
     def wait_end(self, timeout_s: float) -> None:
@@ -157,7 +158,7 @@ class Backlog:
     def _append(self, item: LogMessage | LogAttachment) -> None:
         self._items.append(item)
         self._bytes += len(item.data)
-        if len(self._items) == BATCH_MESSAGES:
+        if len(self._items) == self._worth_waking:
             self._ready.notify()
 
     def _has_room(self, message: LogMessage) -> bool:

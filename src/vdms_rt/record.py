@@ -192,6 +192,9 @@ class Recorder:
         elif log.sealed:
             self._close(log, "")
             return
+        elif len(self._backlog) and (why := self._full(log)):
+            self._close(log, why)
+            return
         elif self._trouble:
             self._sync(log)
         for item in self._backlog.take():
@@ -199,8 +202,8 @@ class Recorder:
         log.drain()
         if time.monotonic() >= self._sync_due_s:
             self._sync(log)
-        if reason := self._reason_to_close(log):
-            self._close(log, reason)
+        if self._ending and not len(self._backlog) and not self._backlog.has_lost:
+            self._close(log, self._end_reason or "")
 
     def _write(self, log: LogWriter, item: LogMessage | LogAttachment) -> None:
         if isinstance(item, LogAttachment):
@@ -231,9 +234,8 @@ class Recorder:
             self._disk_free_bytes = free_bytes
         self._unsynced.clear()
 
-    def _reason_to_close(self, log: LogWriter) -> str:
-        if self._ending and not len(self._backlog) and not self._backlog.has_lost:
-            return self._end_reason or ""
+    def _full(self, log: LogWriter) -> str:
+        """Return why what comes next belongs into the next file, or nothing."""
         if time.monotonic() - self._part_opened_s >= self._config.rotate_s:
             return f"continued in the next file after {self._config.rotate_s:g} s"
         if log.length >= self._config.rotate_mb * 1e6:

@@ -64,7 +64,9 @@ def repair_directory(directory: Path) -> list[Repaired]:
         except (BlockingIOError, FileNotFoundError):  # being written, or just completed
             continue
         except (OSError, LogFileError) as error:
-            reason = error.strerror if isinstance(error, OSError) else str(error)
+            reason = str(error)
+            if isinstance(error, OSError):
+                reason = (error.strerror or reason).lower()
             done.append(Repaired(part, 0, 0, f"{part}: cannot be repaired, and stays: {reason}"))
     return done
 
