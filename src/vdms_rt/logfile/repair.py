@@ -182,6 +182,9 @@ class _Copy:
     def _chunk(self, block: Block, chunk: Chunk, messages: list[StoredMessage]) -> None:
         if block.orphans:
             chunk, messages = _without_orphans(messages)
+        times_ns = [stored.message.log_time for stored in messages]
+        # No checksum covers these two in the file.
+        chunk.message_start_time, chunk.message_end_time = min(times_ns), max(times_ns)
         start = self._offset
         length = self._record(chunk)
         times_by_channel: dict[int, list[tuple[int, int]]] = defaultdict(list)
@@ -296,12 +299,11 @@ def _without_orphans(messages: list[StoredMessage]) -> tuple[Chunk, list[StoredM
         moved.append(StoredMessage(stored.channel, stored.schema, stored.message, builder.count))
         stored.message.write(builder)
     data = _taken(builder)
-    times_ns = [stored.message.log_time for stored in messages]
     chunk = Chunk(
         compression="zstd",
         data=zstandard.compress(data),
-        message_end_time=max(times_ns),
-        message_start_time=min(times_ns),
+        message_end_time=0,
+        message_start_time=0,
         uncompressed_crc=zlib.crc32(data),
         uncompressed_size=len(data),
     )
