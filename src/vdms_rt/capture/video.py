@@ -1,8 +1,8 @@
 """The luma of a video file, exact: the Y plane as the codec gives it, never by way of RGB and back.
 
-What OpenCV can deliver that way was tried format by format; tests hold it. Two things it cannot:
-a YUV file that is marked full range comes scaled to 16..235, and uncompressed RGB is refused,
-because OpenCV 5.0 writes past its buffers on the bottom-up pictures of such files.
+What OpenCV can deliver that way was tried format by format; tests hold it. Two things it cannot: a
+compressed YUV file whose container, not its codec, says full range comes scaled to 16..235; and
+uncompressed RGB is refused, because OpenCV 5.0 writes past its buffers on its bottom-up pictures.
 """
 
 from __future__ import annotations
@@ -82,30 +82,30 @@ class Video:
             return self._from_packet, [cv2.CAP_PROP_FORMAT, -1], "exact"
         if self._pixels == GREY_16:
             return self._from_any, [cv2.CAP_PROP_CONVERT_RGB, 0], "16 bits made 8"
-        if self._pixels in PLANAR and self._plane_is_luma():
-            luma = "exact"
-            if self._pixels != "Y800":
-                luma = "Y plane; scaled to 16..235 if the file is marked full range"
+        if self._pixels in PLANAR and (luma := self._first_plane()):
             return self._checked, [cv2.CAP_PROP_CONVERT_RGB, 0], luma
         return self._from_any, [], "Rec. 601 from the colours, rounded"
 
-    def _plane_is_luma(self) -> bool:
-        """Whether OpenCV's untouched first plane is the luma of the picture."""
+    def _first_plane(self) -> str:
+        """Return what OpenCV's untouched first plane is, or nothing if it is not luma."""
         seen = []
         for settings in ([cv2.CAP_PROP_CONVERT_RGB, 0], []):
             capture = _open(self.path, settings)
             there, image = capture.read()
             capture.release()
             if not there:
-                return True
+                return "exact"
             seen.append(image)
         plane, colours = seen
         if plane.shape != (self.height_px, self.width_px) or plane.dtype != np.uint8:
-            return False
-        if self._pixels == "Y800":
-            return True
-        expected = 16 + self._from_any(colours) * (219 / 255)
-        return float(np.abs(np.clip(plane, 16, 235) - expected).mean()) <= AGREES_GREY
+            return ""
+        luma = self._from_any(colours)
+        if np.abs(plane - luma.astype(np.float64)).mean() <= AGREES_GREY:
+            return "exact"
+        limited = 16 + luma * (219 / 255)
+        if np.abs(np.clip(plane, 16, 235) - limited).mean() <= AGREES_GREY:
+            return "Y plane; scaled to 16..235 if the container says full range"
+        return ""
 
     def _packet_bytes(self) -> int | None:
         """Return the size of an uncompressed frame, or None in a format that is not known."""
