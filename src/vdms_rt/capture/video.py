@@ -99,13 +99,14 @@ class Video:
         plane, colours = seen
         if plane.shape != (self.height_px, self.width_px) or plane.dtype != np.uint8:
             return ""
-        luma = self._from_any(colours)
-        if np.abs(plane - luma.astype(np.float64)).mean() <= AGREES_GREY:
+        luma = self._from_any(colours).astype(np.float64)
+        from_full = np.abs(plane - luma).mean()
+        from_limited = np.abs(np.clip(plane, 16, 235) - (16 + luma * (219 / 255))).mean()
+        if min(from_full, from_limited) > AGREES_GREY:
+            return ""
+        if from_full < from_limited:
             return "exact"
-        limited = 16 + luma * (219 / 255)
-        if np.abs(np.clip(plane, 16, 235) - limited).mean() <= AGREES_GREY:
-            return "Y plane; scaled to 16..235 if the container says full range"
-        return ""
+        return "Y plane; scaled to 16..235 if the container says full range"
 
     def _packet_bytes(self) -> int | None:
         """Return the size of an uncompressed frame, or None in a format that is not known."""
