@@ -14,8 +14,10 @@ from vdms_rt.config import Table
 Floats: TypeAlias = NDArray[np.float64]
 
 PHASES = 512
-"""Sub-pixel positions for which the blur is tabulated; linear between them, to 1e-6."""
+"""Sub-pixel positions for which the blur is tabulated, linear between them: right to 2e-5."""
 TAIL_SIGMAS = 3.7
+TURNING = 0.147
+"""Just below 4/27, where r (1 - a r^2) has no larger value."""
 SHARP_PX = 0.3
 """Below this blur an outline is cut into short chords; above, quadrature needs few points."""
 
@@ -103,7 +105,7 @@ class Camera:
         s - a s^3 = 1. Beyond the turning point of a pincushion, outside the picture, s is held.
         """
         square = (ideal**2).sum(axis=1) / self._corner**2
-        a = np.minimum(self._distortion * square, 0.147)
+        a = np.minimum(self._distortion * square, TURNING)
         s = np.ones_like(a)
         for _ in range(12):
             change = (s - a * s**3 - 1) / (1 - 3 * a * s**2)
@@ -111,7 +113,7 @@ class Camera:
             if np.abs(change).max(initial=0.0) < 1e-12:
                 break
         radial = (ideal * steps).sum(axis=1) / self._corner**2
-        stretch = 2 * self._distortion * radial * s**3 / (1 - 3 * a * s**2)
+        stretch = 2 * self._distortion * radial * s**3 / (1 - 3 * a * s**2) * (a < TURNING)
         return ideal * s[:, None], steps * s[:, None] + ideal * stretch[:, None]
 
 

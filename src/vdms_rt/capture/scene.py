@@ -29,9 +29,6 @@ Greys: TypeAlias = NDArray[np.float32]
 SPACING_BLURS = 1.3
 """Between the points of an outline, in standard deviations of the blur: the aliasing of the
 trapezoidal rule is exp(-2 pi^2 / 1.3^2) = 1e-5 of the contrast."""
-
-
-EDGES = 4
 CROWD = 6
 """Points over which the spacing shrinks towards a corner."""
 
@@ -46,20 +43,20 @@ class Pose(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """One sheet as outlines: its four edges, then its circles, counter-clockwise."""
+    """One sheet as outlines, counter-clockwise: points and steps along them, both (n, 2)."""
 
     points_mm: Floats
     steps_mm: Floats
-    """Along the outline to the next point; both (n, 2)."""
-    parts: tuple[slice, ...]
-    """The points of each edge and circle."""
+    edges: tuple[slice, ...]
+    """The points of each edge."""
+    circles: tuple[slice, ...]
     ground_grey: float
     ink_grey: float
     moves: bool
 
 
-class Lit(NamedTuple):
-    """Part of the picture, from row `top` and column `left` on."""
+class Patch(NamedTuple):
+    """Light in a part of the picture, from row `top` and column `left` on."""
 
     top: int
     left: int
@@ -71,9 +68,10 @@ class Scene:
 
     The light that a pixel gets from a shape is the shape's area under the pixel, blurred by the
     Gaussian of camera and bandwidth. By Green's theorem this is an integral along the shape's
-    outline alone; the trapezoidal rule (smooth and closed) and Gauss-Legendre panels (straight)
-    give it to a few thousandths of a grey level with a point for each 0.6 px. Where a sheet's edge
-    crosses the laboratory, the laboratory counts as even within a pixel's blur.
+    outline alone, which the trapezoidal rule gives to some hundredths of a grey level with a point
+    for each 0.8 px (see Trefethen and Weideman, The Exponentially Convergent Trapezoidal Rule,
+    2014). Where a sheet's edge crosses the laboratory, the laboratory counts as even within the
+    blur. Sheets that move hang in front of those that do not.
     """
 
     def __init__(self, table: Table, shapes: Sequence[MarkerShape], reach_mm: float) -> None:
@@ -114,7 +112,7 @@ class Scene:
         self._shakes = table.shake_mm > 0
         self.picture: Greys = np.zeros((table.height_px, table.width_px), np.float32)
         self._still: Greys = self.picture.copy()
-        self._front = self._sheets
+        self._front = sorted(self._sheets, key=lambda sheet: sheet.moves)
         if not self._shakes:
             still = [sheet for sheet in self._sheets if not sheet.moves]
             self._front = [sheet for sheet in self._sheets if sheet.moves]
@@ -162,21 +160,28 @@ class Scene:
     def _hang(self, table: Table, shape: MarkerShape, at_mm: Floats, moves: bool) -> Sheet:
         left, bottom, right, top = sheet_mm(shape)
         corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) + at_mm
-        points, steps = [], []
-        for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            p, s = self._straight(begin, end)
-            points.append(p)
-            steps.append(s)
-        for centre in np.array(shape.circles_mm) + at_mm:
-            p, s = self._circle(centre, shape.diameter_mm / 2)
-            points.append(p)
-            steps.append(s)
+        outlines = [
+            self._straight(begin, end)
+            for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        ]
+        outlines += [
+            self._circle(centre, shape.diameter_mm / 2)
+            for centre in np.array(shape.circles_mm) + at_mm
+        ]
+        ends = np.cumsum([len(points) for points, _ in outlines])
+        parts = [slice(end - len(o[0]), end) for end, o in zip(ends, outlines, strict=True)]
         ground, ink = table.black_grey, table.white_grey
         if not shape.white_on_black:
             ground, ink = ink, ground
-        ends = np.cumsum([len(p) for p in points])
-        parts = tuple(slice(end - len(p), end) for end, p in zip(ends, points, strict=True))
-        return Sheet(np.concatenate(points), np.concatenate(steps), parts, ground, ink, moves)
+        return Sheet(
+            points_mm=np.concatenate([points for points, _ in outlines]),
+            steps_mm=np.concatenate([steps for _, steps in outlines]),
+            edges=tuple(parts[: len(corners)]),
+            circles=tuple(parts[len(corners) :]),
+            ground_grey=ground,
+            ink_grey=ink,
+            moves=moves,
+        )
 
     def _length_px(self, points_mm: Floats, steps_mm: Floats) -> float:
         """Return the longest step in the picture, with room for motion towards the camera."""
@@ -215,7 +220,7 @@ class Scene:
                 for points, y_steps, weight in traces
                 for part in parts
             ]
-            for parts in (sheet.parts[:EDGES], sheet.parts[EDGES:])
+            for parts in (sheet.edges, sheet.circles)
         )
         rows = slice(min(p.top for p in edges), max(p.top + p.light.shape[0] for p in edges))
         columns = slice(min(p.left for p in edges), max(p.left + p.light.shape[1] for p in edges))
@@ -240,8 +245,9 @@ class Scene:
         shape: tuple[int, int],
         first_row: int,
         row_step: int,
-    ) -> Lit:
-        """Return what part of each pixel's light comes from the right of a piece of outline."""
+    ) -> Patch:
+        """Return what part of each pixel's light comes from the right of a piece of outline, if
+        the outline goes down there, else less than nothing."""
         left, across = self._columns.at(points[:, 0])
         if self._sharp:
             top, down = self._chords(points[:, 1], y_steps, first_row, row_step)
@@ -260,7 +266,7 @@ class Scene:
             (height + 1) * (width + 1),
         ).reshape(height + 1, width + 1)
         light = weight * np.cumsum(rise[:height, :width], axis=1)
-        return Lit(row_0, column_0, np.asarray(light, dtype=np.float64))
+        return Patch(row_0, column_0, np.asarray(light, dtype=np.float64))
 
     def _trace(self, sheet: Sheet, pose: Pose) -> tuple[Floats, Floats]:
         homography = self.camera.homography(pose.shake_mm)
