@@ -176,6 +176,7 @@ class Publisher:
             # With the smallest queue a busy computer drops samples that it need not.
             "transport/link/tx/queue/size/data_high": 16,
             "transport/link/tx/queue/size/data": 16,
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
             "access_control": _ACCESS,
         }.items():
             config.insert_json5(name, json.dumps(value))
@@ -213,7 +214,12 @@ class Publisher:
             encoding=encoding,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=priority,
-            cache=ext.CacheConfig(max_samples=self._history if topic.recovered else 1),
+            # While it replays, the history is locked against `put`: a reader that stops in the
+            # middle may therefore lose some of it, but not stop the station.
+            cache=ext.CacheConfig(
+                max_samples=self._history if topic.recovered else 1,
+                replies_config=ext.RepliesConfig(congestion_control=zenoh.CongestionControl.DROP),
+            ),
             publisher_detection=True,
             sample_miss_detection=(
                 ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)

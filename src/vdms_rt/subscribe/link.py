@@ -1,0 +1,245 @@
+"""One session with one address: connects, stays connected, and fills an inbox."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import logging
+import queue
+import threading
+import time
+from collections import deque
+from typing import NamedTuple
+
+import zenoh
+from zenoh import ext
+from zenoh.handlers import Callback
+
+from vdms_rt.subscribe.samples import SOURCES_REMEMBERED, Arrived, Left, Raw
+from vdms_rt.wire.session import SESSION, reason
+from vdms_rt.wire.topics import ALIVE_KEY
+
+CONNECT_TIMEOUT_S = 1.0
+RETRY_S = 0.2
+HISTORY_TIMEOUT_S = 10.0
+
+log = logging.getLogger("vdms_rt.subscribe")
+
+
+class Inbox:
+    """Where the links put what comes; it never makes them wait."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._waiting: deque[Raw | Arrived | Left] = deque()
+        self._changed = threading.Condition(threading.Lock())
+        self.closed = False
+
+    def put(self, item: Raw | Arrived | Left) -> None:
+        """Add it, or drop a message when `limit` items wait: the reader then finds the gap."""
+        with self._changed:
+            if len(self._waiting) < self._limit or not isinstance(item, Raw):
+                self._waiting.append(item)
+                self._changed.notify()
+
+    def take(self, timeout_s: float | None) -> Raw | Arrived | Left | None:
+        """Return the oldest item, or None if none came in time or the inbox is closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self.closed, timeout_s)
+            return self._waiting.popleft() if self._waiting and not self.closed else None
+
+    def close(self) -> None:
+        """Let go whoever waits."""
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
+
+
+class _Request(NamedTuple):
+    """Ask the stations' histories for `selector`, and then release what is held of `source`."""
+
+    selector: str
+    source: str
+
+
+class Link:
+    """A thread that connects, keeps the session, and asks for history, until `stop`.
+
+    zenoh's advanced subscriber puts samples in order and recovers what is missing once it has a
+    first one. Its own history loses a race: a live sample that comes between its two queries ends
+    it. So the history is asked for here: the first sample of each publisher is held until what
+    the publisher keeps from before it has come.
+    """
+
+    def __init__(self, endpoint: str, key: str, history: bool, inbox: Inbox) -> None:
+        self.endpoint = endpoint
+        self._key = key
+        self._history = history
+        self._inbox = inbox
+        self._session: zenoh.Session | None = None
+        self._cancel = zenoh.CancellationToken()
+        self._requests: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._known: dict[str, None] = {}
+        self._held: dict[str, list[Raw]] = {}
+        self._thread = threading.Thread(target=self._run, name=f"subscribe {endpoint}", daemon=True)
+        _running.add(self)
+        self._thread.start()
+
+    @property
+    def connected(self) -> bool:
+        """Somebody answers at the address."""
+        session = self._session
+        return session is not None and bool(session.info.transports())
+
+    def abandon(self) -> None:
+        """Let it end by itself. Takes no lock, so the garbage collector may call it."""
+        self._requests.put(None)
+
+    def stop(self) -> None:
+        """End it now; `join` waits until it has."""
+        self.abandon()
+        self._cancel.cancel()  # type: ignore[no-untyped-call]
+
+    def join(self) -> None:
+        """Wait until its thread has ended: at most as long as one attempt to connect."""
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            session = self._open()
+            if session is not None:
+                self._serve(session)
+        finally:
+            _running.discard(self)
+
+    def _open(self) -> zenoh.Session | None:
+        config = zenoh.Config()
+        for name, value in {
+            **SESSION,
+            "mode": "client",
+            "connect/endpoints": [self.endpoint],
+            "connect/timeout_ms": round(CONNECT_TIMEOUT_S * 1000),
+        }.items():
+            config.insert_json5(name, json.dumps(value))
+        while True:
+            try:
+                return zenoh.open(config)
+            except zenoh.ZError as error:
+                log.debug("%s: %s", self.endpoint, reason(error))
+            try:
+                self._requests.get(timeout=RETRY_S)
+            except queue.Empty:
+                continue
+            return None
+
+    def _serve(self, session: zenoh.Session) -> None:
+        # The interpreter's exit hangs on a zenoh callback that is still declared, so all are
+        # undeclared here, in order. They run in zenoh's own thread: they only fill the inbox.
+        with (
+            session,
+            ext.declare_advanced_subscriber(
+                session,
+                self._key,
+                Callback(self._on_sample, indirect=False),
+                recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+            ),
+            session.liveliness().declare_subscriber(
+                _alive_key(self._key), Callback(self._on_alive, indirect=False), history=True
+            ),
+        ):
+            self._session = session
+            while (request := self._requests.get()) is not None:
+                self._fetch(session, request)
+            self._session = None
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        raw = _raw(sample)
+        if not (self._history and raw.sequenced):
+            self._inbox.put(raw)
+            return
+        with self._lock:
+            if raw.source in self._held:
+                self._held[raw.source].append(raw)
+            elif raw.source in self._known or raw.number == 0:
+                self._know(raw.source)
+                self._inbox.put(raw)
+            else:
+                self._know(raw.source)
+                self._held[raw.source] = [raw]
+                before = f"{raw.key}/@adv/pub/{raw.source}/**?_sn=..{raw.number - 1}"
+                self._requests.put(_Request(before, raw.source))
+
+    def _know(self, source: str) -> None:
+        self._known[source] = None
+        if len(self._known) > SOURCES_REMEMBERED:
+            self._known.pop(next(iter(self._known)))
+
+    def _on_alive(self, sample: zenoh.Sample) -> None:
+        station = str(sample.key_expr).split("/")[1]
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self._inbox.put(Left(station))
+            return
+        self._inbox.put(Arrived(station))
+        if self._history:
+            # The last message of each topic that has no numbers.
+            self._requests.put(_Request(f"{self._key}/@adv/pub/*/uhlc/**", ""))
+
+    def _fetch(self, session: zenoh.Session, request: _Request) -> None:
+        try:
+            replies = session.get(
+                request.selector,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+                timeout=HISTORY_TIMEOUT_S,
+                cancellation_token=self._cancel,
+            )
+            kept = sorted(
+                (_raw(reply.ok) for reply in replies if reply.ok is not None),
+                key=lambda raw: raw.number,
+            )
+        except zenoh.ZError as error:
+            log.warning("%s: no history of %s: %s", self.endpoint, request.selector, reason(error))
+            kept = []
+        with self._lock:
+            for raw in (*kept, *self._held.pop(request.source, ())):
+                self._inbox.put(raw)
+
+
+_running: set[Link] = set()
+
+
+@atexit.register
+def _stop_all() -> None:
+    """zenoh must be silent before the interpreter goes."""
+    running = tuple(_running)
+    for link in running:
+        link.stop()
+    for link in running:
+        link.join()
+
+
+def _alive_key(key: str) -> str:
+    """Return the liveliness key of the stations that `key` asks for."""
+    chunks = key.split("/")
+    station = chunks[1] if len(chunks) > 1 and "**" not in chunks[:2] else "*"
+    return ALIVE_KEY.format(station=station)
+
+
+def _raw(sample: zenoh.Sample) -> Raw:
+    info = sample.source_info
+    stamp = sample.timestamp
+    if info is not None:
+        source, number = f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn
+    elif stamp is not None:
+        source, number = bytes(stamp.get_id()).hex(), stamp.get_time_as_ntp64().as_nanos()
+    else:
+        source, number = "", 0
+    return Raw(
+        key=str(sample.key_expr),
+        data=sample.payload.to_bytes(),
+        received_ns=time.monotonic_ns(),
+        source=source,
+        number=number,
+        sequenced=info is not None,
+    )

@@ -1,0 +1,173 @@
+"""What a subscriber gets: samples and notices, out of messages as they came."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+from google.protobuf.message import DecodeError, Message
+
+from vdms_rt.model import Displacement, Event, Health, Truth
+from vdms_rt.wire import convert
+from vdms_rt.wire.topics import DISPLACEMENT, EVENT, HEALTH, TOPICS, TRUTH
+
+SOURCES_REMEMBERED = 4096
+SN_RANGE = 1 << 32
+"""zenoh's sequence numbers wrap."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One message of a station."""
+
+    station: str
+    marker: str
+    """Empty where the topic is of the whole station."""
+    topic: str
+    received_ns: int
+    """When it came, on this computer's monotonic clock."""
+    value: Displacement | Truth | Health | Event | Message | bytes
+    """The message of the topic (`vdms_pb2`) where there is no type of ours, the bytes where the
+    topic is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Missed:
+    """Displacements that this subscriber never got, first and last included."""
+
+    station: str
+    marker: str
+    session: int
+    first_seq: int
+    last_seq: int
+    on_the_way: int
+    """How many of them the station had sent; it never had the others: lost frames."""
+
+    @property
+    def count(self) -> int:
+        return self.last_seq - self.first_seq + 1
+
+    def __str__(self) -> str:
+        return (
+            f"{self.station}/{self.marker}: missed seq {self.first_seq} to {self.last_seq} "
+            f"({self.count} samples, {self.on_the_way} of them on the way)"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Arrived:
+    """A station's daemon runs and can be reached."""
+
+    station: str
+
+    def __str__(self) -> str:
+        return f"{self.station}: arrived"
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """A station's daemon stopped or cannot be reached any more."""
+
+    station: str
+
+    def __str__(self) -> str:
+        return f"{self.station}: left"
+
+
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """Bytes that are not what their key promises."""
+
+    key: str
+    why: str
+
+    def __str__(self) -> str:
+        return f"{self.key}: cannot be read: {self.why}"
+
+
+Notice: TypeAlias = Missed | Arrived | Left | Unreadable
+
+
+class Raw(NamedTuple):
+    """A message as it came."""
+
+    key: str
+    data: bytes
+    received_ns: int
+    source: str
+    """Who numbered it: a publisher, or only its session where it is not `sequenced`."""
+    number: int
+    """zenoh's sequence number, or its time stamp where there is none."""
+    sequenced: bool
+
+
+class Reader:
+    """Decodes, drops doubles and finds gaps. One thread uses it."""
+
+    def __init__(self) -> None:
+        self._last: dict[tuple[str, str], tuple[int, Raw]] = {}
+
+    def read(self, raw: Raw) -> Iterator[Sample | Notice]:
+        """Return the sample, and before it what is missing there; nothing for a double."""
+        station, marker, topic = _parts(raw.key)
+        try:
+            value = _decode(topic, raw.data)
+        except (DecodeError, ValueError) as error:
+            yield Unreadable(raw.key, str(error))
+            return
+        if isinstance(value, Displacement):
+            of, seq = (raw.key, str(value.session)), value.seq
+        else:
+            of, seq = (raw.key, raw.source), raw.number
+        last_seq, last = self._last.get(of, (None, raw))
+        if last_seq is not None and seq <= last_seq:
+            return
+        self._remember(of, seq, raw)
+        if isinstance(value, Displacement) and last_seq is not None and seq > last_seq + 1:
+            yield Missed(
+                station,
+                marker,
+                value.session,
+                first_seq=last_seq + 1,
+                last_seq=seq - 1,
+                on_the_way=_lost_between(last, raw, seq - last_seq - 1),
+            )
+        yield Sample(station, marker, topic, raw.received_ns, value)
+
+    def _remember(self, of: tuple[str, str], seq: int, raw: Raw) -> None:
+        self._last[of] = seq, raw
+        if len(self._last) > SOURCES_REMEMBERED:
+            self._last.pop(next(iter(self._last)))
+
+
+def _lost_between(last: Raw, raw: Raw, missing: int) -> int:
+    if raw.sequenced and raw.source == last.source:
+        return min(missing, (raw.number - last.number) % SN_RANGE - 1)
+    return missing
+
+
+def _parts(key: str) -> tuple[str, str, str]:
+    """Return station, marker and topic; what a key does not have is empty."""
+    match key.split("/"):
+        case [_, station, marker, topic]:
+            return station, marker, topic
+        case [_, station, topic]:
+            return station, "", topic
+        case _:
+            return "", "", key
+
+
+_MESSAGES = {topic.name: topic.message for topic in TOPICS}
+_VALUES: dict[str, Callable[[bytes], Displacement | Truth | Health | Event]] = {
+    DISPLACEMENT.name: convert.displacement_from,
+    TRUTH.name: convert.truth_from,
+    HEALTH.name: convert.health_from,
+    EVENT.name: convert.event_from,
+}
+
+
+def _decode(topic: str, data: bytes) -> Displacement | Truth | Health | Event | Message | bytes:
+    if topic in _VALUES:
+        return _VALUES[topic](data)
+    return _MESSAGES[topic].FromString(data) if topic in _MESSAGES else data
