@@ -1,0 +1,62 @@
+"""A recording process that is killed at any moment leaves all but its last second."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from logbook import files, rerun, samples_in
+
+from vdms_rt.logfile.repair import repair_directory
+
+WRITER = Path(__file__).parents[1] / "kill_writer.py"
+MOST_LOST_NS = 1_000_000_000
+
+
+def killed_after(seconds, directory):
+    """Return when each seq was put, by a writer that was killed after `seconds` of recording, and
+    when it was killed."""
+    with subprocess.Popen(
+        [sys.executable, str(WRITER), str(directory)], stdout=subprocess.PIPE
+    ) as writer:
+        first = writer.stdout.readline()
+        time.sleep(seconds)
+        killed_ns = time.monotonic_ns()
+        writer.kill()
+        lines = [first, *writer.stdout.read().splitlines(keepends=True)]
+    said = [line.split() for line in lines if line.endswith(b"\n")]
+    return {int(seq): int(put_ns) for seq, put_ns in said}, killed_ns
+
+
+def check_round(directory, seconds):
+    put_ns, killed_ns = killed_after(seconds, directory)
+    parts = [path for path in files(directory) if path.name.endswith(".part")]
+    repaired = repair_directory(directory)
+    assert len(repaired) == len(parts) <= 1
+    assert all(path.suffix == ".mcap" for path in files(directory))
+    found = [seq for path in files(directory) for seq in samples_in(path)]
+    assert found == list(range(len(found)))
+    lost_ns = [killed_ns - ns for seq, ns in put_ns.items() if seq >= len(found)]
+    assert max(lost_ns, default=0) <= MOST_LOST_NS
+    return repaired
+
+
+def test_a_killed_recording_is_repaired_and_read_by_others(tmp_path):
+    chance = random.Random(7)
+    for number in range(2):
+        directory = tmp_path / str(number)
+        for repaired in check_round(directory, chance.uniform(0.6, 1.6)):
+            if repaired.path.exists():
+                check = rerun(tmp_path, "mcap", "check", str(repaired.path))
+                assert check.returncode == 0, check.stdout + check.stderr
+
+
+@pytest.mark.slow
+def test_twenty_kills_lose_at_most_a_second_each(tmp_path):
+    chance = random.Random(8)
+    for number in range(20):
+        check_round(tmp_path / str(number), chance.uniform(0.05, 2.5))
