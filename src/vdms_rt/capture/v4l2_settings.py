@@ -123,8 +123,8 @@ def agree(node: Node, config: V4l2, field: int) -> Settings:
     # Only the holder of a node's buffers may free them, so this asks whether there is another.
     nothing = api.RequestBuffers(type=api.BUF_TYPE_VIDEO_CAPTURE, memory=api.MEMORY_MMAP)
     node.call(api.VIDIOC_REQBUFS, nothing, "being asked whether it is free")
-    input_name = _set_input(node, config.input)
-    standard, standard_fact = _set_standard(node, config.standard)
+    offered, input_name = _set_input(node, config.input)
+    standard, standard_fact = _set_standard(node, config.standard, offered)
     layout = _set_format(node, config, standard, field)
     scan, known = _scan(node, layout, standard, config.field_order)
     period_s, period_fact = _frame_period(node, layout, standard)
@@ -140,7 +140,8 @@ def agree(node: Node, config: V4l2, field: int) -> Settings:
     return Settings(layout, scan, known, period_s, facts)
 
 
-def _set_input(node: Node, index: int) -> str:
+def _set_input(node: Node, index: int) -> tuple[int, str]:
+    """Return the standards that the input has, as bits, and its number and name."""
     inputs = api.inputs(node.fd)
     if index >= max(len(inputs), 1):
         names = ", ".join(f"{i} {api.text(one.name)}" for i, one in enumerate(inputs))
@@ -148,33 +149,33 @@ def _set_input(node: Node, index: int) -> str:
             f"{node.name} has no input {index}; set v4l2.input to one of: {names or '0'}"
         )
     if not inputs:
-        return "the only one"
+        return 0, "the only one"
     node.call(api.VIDIOC_S_INPUT, c_int(index), f"setting input {index}")
-    return f"{index} {api.text(inputs[index].name)}"
+    return inputs[index].std, f"{index} {api.text(inputs[index].name)}"
 
 
-def _set_standard(node: Node, wanted: str) -> tuple[int, str]:
-    """Return the bits of the standard that was set, 0 where there are none, and words on it."""
+def _set_standard(node: Node, wanted: str, offered: int) -> tuple[int, str]:
+    """Return the bits of the standard that was set, 0 where there are none, and words on it.
+
+    `offered` is what the input has.
+    """
+    names = [name for name, bits in api.STANDARDS.items() if bits & offered]
+    name, how = wanted, "as configured"
     if wanted == "auto":
         detected = c_uint64()
         asked = node.offers(api.VIDIOC_QUERYSTD, detected, "detecting the standard")
-        found = detected_standard(detected.value) if asked else ""
-        name, how = (found, "detected") if found else ("ntsc-m", "assumed, none was detected")
-    else:
-        name, how = wanted, "as configured"
+        name, how = detected_standard(detected.value) if asked else "", "detected"
+        if not name:
+            name, how = next(iter(names), "ntsc-m"), "assumed, none was detected"
     bits = api.STANDARDS[name]
     if node.offers(api.VIDIOC_S_STD, c_uint64(bits), f"setting the standard {name}"):
         return bits, f"{name}, {how}"
-    offered = 0
-    for one in api.inputs(node.fd):
-        offered |= one.std
-    if not offered and wanted == "auto":
+    if wanted == "auto" and not names:
         return 0, "none"
-    known = ", ".join(n for n, b in api.STANDARDS.items() if b & offered) or "none of its own"
-    raise SourceError(
-        f"{node.name} does not accept the standard {name} (it has {known}); set v4l2.standard to "
-        'one of these, or to "auto"'
-    )
+    mend = f"set v4l2.standard to one that it has: {', '.join(names)}"
+    if not names:
+        mend = 'it has none; set v4l2.standard = "auto"'
+    raise SourceError(f"{node.name} does not accept the standard {name}; {mend}")
 
 
 def detected_standard(bits: int) -> str:
