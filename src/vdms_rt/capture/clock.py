@@ -8,19 +8,15 @@ from collections import deque
 from dataclasses import dataclass
 from fractions import Fraction
 
-from vdms_rt.capture.cadence import INTERVALS, Cadence, Pace
+from vdms_rt.capture.cadence import STAMPS, Cadence, Pace
 from vdms_rt.capture.line import StampLine
+from vdms_rt.capture.phase import PhaseWatch
 from vdms_rt.capture.utc import UtcOffset
 from vdms_rt.model import Event, Scan, Severity, SourceInfo, StampEvent, Tick
 
 UTC_SAMPLE_NS = 1_000_000_000
 STALL_NS = 2_000_000_000
 """After so long without an image the source's phase is not taken for granted."""
-LATE_RUN = 12
-"""Images in a row that are all later than any should be: the source's phase has moved. Load holds
-up two or three."""
-EARLY_RUN = 3
-"""Images among the last eight that are earlier than any can be."""
 DISTRUST = 8
 """Images in a row after which the interval is believed and not a sequence that saw no loss."""
 RATE_LIMIT = 400e-6
@@ -114,15 +110,12 @@ class FrameClock:
         self._just_missed = 0
         self._calls, self._taken_back = 0, 0
         """How often images were called missed, and how often in error."""
-        self._lately_missed: deque[int] = deque(maxlen=INTERVALS)
+        self._lately_missed: deque[int] = deque(maxlen=2 * STAMPS)
         self._doubts = 0
-        self._recent: deque[tuple[int, int, bool]] = deque(maxlen=LATE_RUN)
-        """Slot and stamp of the latest images, and whether they came earlier than they can."""
-        self._late_run = 0
-        self._doubt_ns = 0.0
+        self._phase = PhaseWatch()
         self._segment = 0
         self._missed = 0
-        self._sigma_ns = 0.0
+        self._sigma_ns = self._line_sigma_ns = 0.0
         self._events: list[Event] = []
 
     def tick(self, stamp_ns: int, sequence: int, scan: Scan | None = None) -> Tick:
@@ -147,7 +140,13 @@ class FrameClock:
             t_ns, self._sigma_ns = stamp_ns + self._delays_ns[scan], FREE_SIGMA_NS
         else:
             t_ns = self._line.at(self._slot) + self._delays_ns[scan]
-            self._sigma_ns = math.hypot(self._line.sigma_ns(self._slot), self._doubt_ns)
+            self._line_sigma_ns = self._line.sigma_ns(self._slot)
+            self._sigma_ns = math.hypot(
+                self._line_sigma_ns,
+                self._phase.doubt_ns,
+                self._phase.step_sigma_ns,
+                self._held_up_ns(),
+            )
         return Tick(
             index=(self._slot + self._shift) // self._fields,
             t_ns=t_ns,
@@ -198,12 +197,13 @@ class FrameClock:
             skipped = max(0, round(gap_ns / self._period_ns) - 1)
             self._miss(slot, skipped)
             slot += 1 + skipped
-            self._restart([(slot, stamp_ns)], broken)
+            self._restart([(slot, stamp_ns)])
+            self._jump(broken)
             return slot
-        if self._cadence.add(gap_ns, step):
-            pace, period_ns = self._cadence.judge()
-            if pace is not (Pace.UNEVEN if self._free else Pace.AS_SAID):
-                self._change_pace(slot + 1, stamp_ns, pace, period_ns)
+        if self._cadence.add(stamp_ns, step):
+            verdict = self._cadence.judge()
+            if verdict and verdict[0] is not (Pace.UNEVEN if self._free else Pace.AS_SAID):
+                self._change_pace(slot + 1, stamp_ns, *verdict)
                 return slot + 1
         if self._free:
             skipped = step - 1 if self._counts_lost else round(gap_ns / self._period_ns) - 1
@@ -226,7 +226,7 @@ class FrameClock:
 
     def _place(self, slot: int, stamp_ns: int, gap_ns: int, step: int, scan: Scan) -> int:
         """Return the slot of an image on the grid, and count those missed before it."""
-        line, period = self._line, float(self._period_ns)
+        line, period = self._line, self._period
         early_ns = line.early_limit_ns
         late_ns = stamp_ns - line.at(slot + 1)
         if late_ns < -early_ns and self._just_missed:
@@ -243,12 +243,20 @@ class FrameClock:
         self._miss(slot, missed)
         slot += 1 + missed
         late_ns = stamp_ns - line.at(slot)
-        if self._moved(slot, stamp_ns, late_ns, early_ns):
-            return slot
-        if abs(late_ns) < period:
+        moved_ns = 0.0
+        images = line.settled and self._phase.look(
+            slot, stamp_ns, late_ns, early_ns, line.late_limit_ns
+        )
+        if images:
+            before_ns = line.at(slot)
+            self._restart(images)
+            moved_ns = float(line.at(slot) - before_ns)
+        elif abs(late_ns) < period:
             moved_ns = line.add(slot, stamp_ns)
-            if abs(moved_ns) > SHIFT_NS:
-                self._jump(f"they moved by {moved_ns / 1e6:+.1f} ms against the stamps before")
+        shift_ns = max(SHIFT_NS, 5 * self._line_sigma_ns)
+        if images or (line.settled and abs(moved_ns) > shift_ns):
+            self._phase.moved(moved_ns)
+            self._jump(f"the source moved by {moved_ns / 1e6:+.1f} ms against its stamps before")
         if not self._rate_told and line.count >= RATE_SURE and abs(line.rate) > RATE_LIMIT:
             self._tell_rate(line.rate)
         return slot
@@ -287,42 +295,14 @@ class FrameClock:
             self._first_scan = self._scan if paired else scan
             self._shift += ((before if paired else slot) + self._shift) % 2
 
-    def _moved(self, slot: int, stamp_ns: int, late_ns: int, early_ns: float) -> bool:
-        """Look whether the source's phase has changed, and begin anew if so."""
-        self._recent.append((slot, stamp_ns, late_ns < -early_ns))
-        # What is called missed was sometimes only held up.
-        error_ns = self._just_missed * float(self._period_ns)
-        self._doubt_ns = error_ns * math.sqrt(self._taken_back / (self._calls + 1))
-        if not self._line.settled:
-            return False
-        if late_ns < -early_ns:
-            self._doubt_ns = float(-late_ns)
-            last = list(self._recent)[-8:]
-            while not last[0][2]:
-                del last[0]
-            if sum(early for _, _, early in last) < EARLY_RUN:
-                return False
-        elif late_ns > self._line.late_limit_ns:
-            self._late_run += 1
-            if self._late_run > 2:
-                self._doubt_ns = float(late_ns)
-            if self._late_run < LATE_RUN:
-                return False
-            last = list(self._recent)
-        else:
-            self._late_run = 0
-            return False
-        self._restart([(s, t) for s, t, _ in last], f"the source moved by {late_ns / 1e6:+.1f} ms")
-        return True
-
-    def _restart(self, images: list[tuple[int, int]], why: str) -> None:
-        """Begin a segment with slots and stamps that belong together."""
+    def _restart(self, images: list[tuple[int, int]]) -> None:
+        """Begin the line anew with slots and stamps that belong together."""
         self._line.begin(*images[0])
         for slot, stamp_ns in images[1:]:
             self._line.add(slot, stamp_ns)
-        self._late_run, self._doubts, self._just_missed, self._doubt_ns = 0, 0, 0, 0.0
-        self._recent.clear()
-        self._jump(why)
+        self._phase.forget()
+        self._cadence.forget()
+        self._doubts, self._just_missed = 0, 0
 
     def _change_pace(self, slot: int, stamp_ns: int, pace: Pace, period_ns: Fraction) -> None:
         """Go on at another period, or without one."""
@@ -339,10 +319,11 @@ class FrameClock:
         else:
             why = f"images come at an even {said_hz:.3f} Hz again"
         self._set_period(period_ns)
-        self._restart([(slot, stamp_ns)], why)
+        self._restart([(slot, stamp_ns)])
+        self._jump(why)
 
     def _set_period(self, period_ns: Fraction) -> None:
-        self._period_ns = period_ns
+        self._period_ns, self._period = period_ns, float(period_ns)
         self._info = dataclasses.replace(
             self._info, frame_period_s=period_ns * self._fields / 10**9
         )
@@ -379,6 +360,12 @@ class FrameClock:
         held_ms = (stamp_ns - self._line.at(slot - missed)) / 1e6
         self._jump(f"the last {missed} called missed came after all, held up for {held_ms:.0f} ms")
         return slot - missed
+
+    def _held_up_ns(self) -> float:
+        """Return what it means for the latest time that images called missed were sometimes only
+        held up, which the image after them shows."""
+        error_ns = self._just_missed * self._period
+        return error_ns * math.sqrt(self._taken_back / (self._calls + 1))
 
     def _jump(self, why: str) -> None:
         self._segment += 1

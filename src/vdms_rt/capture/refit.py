@@ -8,17 +8,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vdms_rt.capture.line import (
-    SOFT,
-    UNSEEN,
-    WINDOW,
-    Fit,
-    Floats,
-    Lateness,
-    Prior,
-    fits,
-    lateness,
-)
+from vdms_rt.capture.envelope import SOFT, UNSEEN, Fit, Floats, Lateness, Prior, fits, lateness
+from vdms_rt.capture.line import WINDOW
 
 Times: TypeAlias = NDArray[np.int64]
 
