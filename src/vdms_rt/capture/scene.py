@@ -26,9 +26,9 @@ Floats: TypeAlias = NDArray[np.float64]
 Greys: TypeAlias = NDArray[np.float32]
 """Grey levels before noise and rounding, shape (height, width), dtype float32."""
 
-SPACING_BLURS = 1.3
+SPACING_BLURS = 1.5
 """Between the points of an outline, in standard deviations of the blur: the aliasing of the
-trapezoidal rule is exp(-2 pi^2 / 1.3^2) = 1e-5 of the contrast."""
+trapezoidal rule is below exp(-2 pi^2 / 1.5^2) = 2e-4 of the contrast."""
 CROWD = 6
 """Points over which the spacing shrinks towards a corner."""
 
@@ -69,7 +69,7 @@ class Scene:
     The light that a pixel gets from a shape is the shape's area under the pixel, blurred by the
     Gaussian of camera and bandwidth. By Green's theorem this is an integral along the shape's
     outline alone, which the trapezoidal rule gives to some hundredths of a grey level with a point
-    for each 0.8 px (see Trefethen and Weideman, The Exponentially Convergent Trapezoidal Rule,
+    for each 0.9 px (see Trefethen and Weideman, The Exponentially Convergent Trapezoidal Rule,
     2014). Where a sheet's edge crosses the laboratory, the laboratory counts as even within the
     blur. Sheets that move hang in front of those that do not.
     """
