@@ -188,6 +188,8 @@ class Marker(Section):
     regions_px: tuple[tuple[int, int, int, int], ...] = ()
     """With find = "regions": left, top, width, height around each circle, in order."""
     fixed: bool = False
+    axis_deg: float = Field(default=0.0, ge=-180, le=180)
+    """Direction of the table's motion in the marker plane, from x towards y: x_mm is along it."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Marker:
@@ -242,8 +244,8 @@ class SetUpSection(Section):
 
 
 class Process(Section):
-    method: Literal["otsu", "smooth"] = "otsu"
-    sampling: Literal["auto", "frame", "field"] = "frame"
+    method: Literal["otsu", "smooth"] = "smooth"
+    sampling: Literal["auto", "frame", "field"] = "auto"
     ring_slots: int = Field(default=64, ge=64, le=4096)
 
 

@@ -144,6 +144,10 @@ class Frame:
     image: Luma
     scan: Scan
     damage: Damage
+    exposure_ns: int = 0
+    """Time for which each field collected light."""
+    order_known: bool = False
+    """The order of the fields is a fact, not a driver's habit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +171,14 @@ class Picture:
     row_offset: int
     row_step: int
     damage: Damage
+    exposure_ns: int = 0
+    order_known: bool = False
+
+    @property
+    def kind(self) -> Scan:
+        """TOP or BOTTOM for a single field, PROGRESSIVE for any whole frame: pictures of one kind
+        show a resting marker alike."""
+        return self.scan if self.row_step == 2 else Scan.PROGRESSIVE
 
 
 class CircleFlag(IntFlag):

@@ -24,12 +24,13 @@ def _marker_lines(marker: MarkerSetUp, set_up: SetUp) -> list[str]:
     h = np.array(marker.homography)
     scale_x, scale_y = scale_px_per_mm(h)
     centres = np.array(marker.reference_px)
+    contrast = [c for field in marker.fields for c in field.contrast]
     left, top = centres.min(axis=0)
     right = set_up.width_px - 1 - centres.max(axis=0)[0]
     bottom = set_up.height_px - 1 - centres.max(axis=0)[1]
     return [
         f"  scale       {scale_x:.3f} px/mm across, {scale_y:.3f} px/mm up",
-        f"  contrast    {min(marker.contrast):.0f} to {max(marker.contrast):.0f} grey levels",
+        f"  contrast    {min(contrast):.0f} to {max(contrast):.0f} grey levels",
         f"  noise       {marker.noise_px * 1000:.1f} thousandths of a pixel for one circle, "
         f"{marker.noise_px / scale_x / len(centres) ** 0.5 * 1000:.1f} micrometres for the marker",
         f"  room        {left:.0f} px left, {right:.0f} right, {top:.0f} above, {bottom:.0f} below",

@@ -13,6 +13,8 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vdms_rt.config import Config, SetUpSection
+from vdms_rt.measure.expect import Appearance
+from vdms_rt.measure.validity import Limits
 from vdms_rt.model import MarkerShape, Region, Scan, VdmsError
 
 
@@ -24,19 +26,39 @@ class _Value(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+class FieldSetUp(_Value):
+    """How one marker looks at rest in one kind of picture; tuples run over its circles."""
+
+    kind: Scan
+    """TOP or BOTTOM for a single field, PROGRESSIVE for whole frames."""
+    reference_px: tuple[tuple[float, float], ...]
+    """Centres in the reference pose, mean of the stills, whole-frame pixels."""
+    area_px: tuple[float, ...]
+    contrast: tuple[float, ...]
+    appearance: Appearance | None = None
+    """Of method smooth, and its limits."""
+    limits: Limits | None = None
+
+
 class MarkerSetUp(_Value):
     """One marker's reference; tuples run over its circles."""
 
     shape: MarkerShape
     regions: tuple[Region, ...]
-    reference_px: tuple[tuple[float, float], ...]
-    """Centres in the reference pose, mean of the stills, whole-frame pixels."""
-    area_px: tuple[float, ...]
-    contrast: tuple[float, ...]
     noise_px: float
-    """Standard deviation of one centre's coordinate in the stills."""
+    """Standard deviation of one centre's coordinate in one still."""
     homography: tuple[tuple[float, float, float], ...]
-    """3 x 3, marker plane in millimetres to image in pixels."""
+    """3 x 3, marker plane in millimetres to image in pixels, of the mean over the kinds."""
+    fields: tuple[FieldSetUp, ...]
+
+    @property
+    def reference_px(self) -> tuple[tuple[float, float], ...]:
+        """Mean of the kinds' reference centres."""
+        kinds = [f.reference_px for f in self.fields]
+        return tuple(
+            (sum(x for x, _ in c) / len(c), sum(y for _, y in c) / len(c))
+            for c in zip(*kinds, strict=True)
+        )
 
 
 class SetUp(_Value):
@@ -46,6 +68,8 @@ class SetUp(_Value):
     height_px: int
     """Of the whole frame."""
     scan: Scan
+    order_proved: bool = False
+    """Motion has shown that the fields come in the order of `scan`."""
     method: str
     stills: int
     """Pictures that the reference is the mean of."""

@@ -158,7 +158,7 @@ def test_stamps_are_the_index_by_the_rate(tmp_path):
     assert info.sequence_counts_lost
     assert info.stamp_event is StampEvent.MID_EXPOSURE
     grabs = [grab for grab, _ in found]
-    assert [grab.stamp_ns for grab in grabs] == [0, 33_366_667, 66_733_333, 100_100_000]
+    assert [grab.stamp_ns for grab in grabs] == [8_341_667, 41_708_333, 75_075_000, 108_441_667]
     assert [grab.sequence for grab in grabs] == [0, 1, 2, 3]
     assert {(grab.scan, grab.damage, grab.tick) for grab in grabs} == {
         (Scan.TOP_FIRST, Damage.NONE, None)

@@ -8,6 +8,7 @@ import pytest
 from lab_picture import SQUARE, Lab, View, picture
 
 from vdms_rt.config import Config, parse_config
+from vdms_rt.measure.gate import Workspace
 from vdms_rt.measure.marker import find_markers
 from vdms_rt.model import ConfigError, Damage, Frame, Luma, Scan, State, Status
 from vdms_rt.process.pictures import pictures
@@ -32,6 +33,7 @@ class Run:
         self.lab = dataclasses.replace(Lab(), clutter=None, **lab)
         self.progress = begin(Plan.of(config), 42, 720, 480, 0, None)
         self.seq = 0
+        self.work = Workspace()
         self.events: list[str] = []
 
     def image(
@@ -44,10 +46,10 @@ class Run:
         (only,) = pictures(frame(self.seq, image, damage=damage), "frame")
         if self.progress.regions == ():
             self.progress, events = found(
-                self.progress, find_markers(image, self.progress.plan.shapes, only.scan)
+                self.progress, find_markers(image, self.progress.plan.shapes, only.scan), only.t_ns
             )
             self.events += [e.code for e in events]
-        self.progress, samples, events = step(self.progress, only)
+        self.progress, samples, events = step(self.progress, only, self.work)
         self.events += [e.code for e in events]
         self.seq += 1
         assert len(samples) == len(self.progress.plan.shapes)
@@ -87,8 +89,8 @@ def test_a_sample_carries_its_picture() -> None:
 def test_the_same_picture_gives_the_same_numbers() -> None:
     run = Run().reference()
     (only,) = pictures(frame(9, run.image(3.0)), "frame")
-    _, first, _ = step(run.progress, only)
-    _, second, _ = step(run.progress, only)
+    _, first, _ = step(run.progress, only, Workspace())
+    _, second, _ = step(run.progress, only, Workspace())
     assert first == second
 
 
@@ -156,7 +158,7 @@ def test_two_markers_each_give_a_sample() -> None:
         (only,) = pictures(frame(n, run.image(0, 0, views)), "frame")
         run.feed(only.image)
     (only,) = pictures(frame(9, run.image(1.5, 0, views)), "frame")
-    _, samples, _ = step(run.progress, only)
+    _, samples, _ = step(run.progress, only, Workspace())
     assert [s.marker for s in samples] == ["left", "right"]
     for sample in samples:
         assert sample.x_mm == pytest.approx(1.5, abs=0.08)

@@ -50,7 +50,8 @@ class Reel(Protocol):
 class ClipSource:
     """Gives the pictures of a clip at `rate_hz`, as fast as they are taken or in their own time.
 
-    The stamp of picture i is i / rate, exact to the nanosecond, from the beginning of the clip at
+    The stamp of picture i is i / rate, exact to the nanosecond (a quarter of a period later for an
+    interlaced one, whose earlier field is then at i / rate), from the beginning of the clip at
     pace fast and from the first read at pace realtime. A loop goes on counting.
     """
 
@@ -87,7 +88,10 @@ class ClipSource:
         """Fill `out` with the next picture; see `Source.read`."""
         if self._waiting is None:
             self._waiting = self._next()
-        stamp_ns = round(Fraction(self._index * 1_000_000_000) / self._rate_hz)
+        # Of an interlaced picture the earlier field is at i / rate, so that no time is before 0;
+        # the stamp is the middle of both.
+        quarters = 4 * self._index + self._info.scan.interlaced
+        stamp_ns = round(Fraction(quarters * 250_000_000) / self._rate_hz)
         if self._realtime:
             if self._start_ns is None:
                 self._start_ns = time.monotonic_ns()

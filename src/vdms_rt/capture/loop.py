@@ -69,6 +69,7 @@ class Capture:
         self._on_truth = on_truth
         self._clock: FrameClock | None = None
         self._clock_for: object = None
+        self._exposure_ns = 0
         self._first_index = 0
         self._first_segment = 0
         self._missed_before = 0
@@ -169,11 +170,18 @@ class Capture:
                     image=slot.view,
                     scan=grab.scan,
                     damage=grab.damage,
+                    exposure_ns=self._exposure_ns,
+                    order_known=source.info.scan_known,
                 ),
             )
 
     def _fit_clock(self, info: SourceInfo) -> None:
         """Keep the clock for a source that comes back as it was; else go on with a new one."""
+        self._exposure_ns = (
+            round(self._config.camera.exposure_ms * 1e6)
+            if info.exposure_ns is None
+            else info.exposure_ns
+        )
         kind = (info.kind, info.frame_period_s, info.scan, info.stamp_event)
         if kind == self._clock_for:
             return
@@ -181,9 +189,8 @@ class Capture:
         self._first_index = self._last.index + 1
         self._first_segment = self._last.segment + 1 if self._clock else 0
         self._missed_before = self.counters.missed
-        camera = self._config.camera
         self._clock = FrameClock(
-            info, round(camera.exposure_ms * 1e6), round(camera.chain_delay_ms * 1e6)
+            info, self._exposure_ns, round(self._config.camera.chain_delay_ms * 1e6)
         )
 
     def _tick(self, grab: Grab) -> Tick:

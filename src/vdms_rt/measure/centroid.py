@@ -69,5 +69,25 @@ def otsu_circle(
     )
 
 
+def otsu_semi_axes(
+    image: Luma, region: Region, white: bool, row_offset: int = 0, row_step: int = 1
+) -> tuple[float, float]:
+    """Return half the extent along x and along y of the circle's picture in a region, in pixels of
+    the whole frame, from the second moments of the pixels on the circle's side of the threshold.
+
+    The arguments are those of `otsu_circle`, which must have found the circle.
+    """
+    left, top = max(region.x_px, 0), max(-((row_offset - region.y_px) // row_step), 0)
+    bottom = -((row_offset - region.y_px - region.height_px) // row_step)
+    view = image[top : max(bottom, 0), left : max(region.x_px + region.width_px, 0)]
+    kind = cv2.THRESH_BINARY if white else cv2.THRESH_BINARY_INV
+    _, mask = cv2.threshold(view, 0, 1, kind | cv2.THRESH_OTSU)
+    m = cv2.moments(mask, binaryImage=True)
+    return (
+        2 * math.sqrt(max(m["mu20"] / m["m00"], 0.25)),
+        2 * row_step * math.sqrt(max(m["mu02"] / m["m00"], 0.25)),
+    )
+
+
 def _lost(area_px: float, contrast: float) -> Circle:
     return Circle(math.nan, math.nan, area_px, contrast, CircleFlag.LOST)

@@ -54,10 +54,9 @@ def rigid_motion(
     arms = reference_mm - reference_mm.mean(axis=0)
     changes = now_mm - reference_mm
     weights = np.linalg.inv(covariance_mm2[good])
-    angle = 0.0
+    angle = _turn(arms[good], now_mm[good])
     shift = np.zeros(2)
-    for _ in range(3):
-        # One step is exact for the shift and leaves an angle's error of its cube.
+    for _ in range(4):
         c, s = math.cos(angle), math.sin(angle)
         turned = arms @ np.array([[c, s], [-s, c]])
         residuals = changes + arms - turned - shift
@@ -70,7 +69,8 @@ def rigid_motion(
         step = covariance @ (weighed @ residuals[good][:, :, None]).sum(axis=0)[:, 0]
         shift += step[:2]
         angle += step[2]
-        if abs(step[2]) < 1e-9:
+        # What a step leaves is its square's half of the arms: below a nanometre.
+        if abs(step[2]) < 1e-5:
             break
     residuals = residuals - slopes @ step
     # A used circle has pulled the fit towards itself, so its residual is smaller than its error.
@@ -86,6 +86,14 @@ def rigid_motion(
         covariance=covariance,
         misfit=tuple(misfit.tolist()),
         used=tuple(good.tolist()),
+    )
+
+
+def _turn(arms_mm: Points, now_mm: Points) -> float:
+    """Return the angle in radians by which unweighed arms have turned."""
+    a, b = arms_mm - arms_mm.mean(axis=0), now_mm - now_mm.mean(axis=0)
+    return math.atan2(
+        float(a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0]), float(a[:, 0] @ b[:, 0] + a[:, 1] @ b[:, 1])
     )
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from vdms_rt.config import Config
+from vdms_rt.measure.gate import Workspace
 from vdms_rt.model import (
     Displacement,
     Event,
@@ -94,6 +95,7 @@ class Processor:
         self._progress: Progress | None = None
         self._asked_ns: int | None = None
         self._told_missing = False
+        self._work = Workspace()
         if stored is not None and not trust_stored and (why := mismatch(stored, config)):
             outlet.event(
                 Event(Severity.WARNING, "set-up-ignored", f"the stored set-up is ignored: {why}")
@@ -117,11 +119,11 @@ class Processor:
 
     def _measure(self, frame: Frame, stop: threading.Event) -> None:
         progress = self._progress_for(frame)
-        for picture in pictures(frame, self._sampling):
-            if progress.phase is Phase.SEARCHING:
+        for picture in pictures(frame, self._sampling, progress.order):
+            if progress.searched:
                 progress = self._searched(progress, picture, stop)
             before = progress.set_up
-            progress, samples, events = step(progress, picture)
+            progress, samples, events = step(progress, picture, self._work)
             for sample in samples:
                 self._count(sample)
                 self._outlet.displacement(sample)
@@ -144,7 +146,16 @@ class Processor:
         if now is not None:
             text = f"pictures are now {width_px} x {height_px} px; a new reference is needed"
             self._outlet.event(Event(Severity.WARNING, "size-changed", text))
-        progress = begin(self._plan, self._session, width_px, height_px, revision, self._stored)
+        progress = begin(
+            self._plan,
+            self._session,
+            width_px,
+            height_px,
+            revision,
+            self._stored,
+            frame.exposure_ns,
+            frame.period_ns,
+        )
         if self._trust and progress.phase is Phase.CHECKING:
             progress = trusted(progress)
         if progress.set_up is not None:
@@ -162,7 +173,7 @@ class Processor:
             answer = self._search.answer(TAKE_TIMEOUT_S)
         if answer is None:
             return progress
-        progress, events = found(progress, answer)
+        progress, events = found(progress, answer, self._asked_ns or picture.t_ns)
         if progress.phase is Phase.SEARCHING and not self._told_missing:
             events = (*events, _missing(self._plan, answer))
         self._told_missing = progress.phase is Phase.SEARCHING

@@ -5,22 +5,24 @@ from __future__ import annotations
 from vdms_rt.model import Frame, Picture, Scan
 
 
-def pictures(frame: Frame, sampling: str) -> tuple[Picture, ...]:
+def pictures(frame: Frame, sampling: str, order: Scan | None = None) -> tuple[Picture, ...]:
     """Return what gets measured of a frame, in the order of exposure: itself, or its two fields.
 
-    With sampling "field" an interlaced frame gives two; `seq` is then 2 x frame + k.
+    With sampling "field" or "auto" an interlaced frame gives two; `seq` is then 2 x frame + k.
+    `order`, TOP_FIRST or BOTTOM_FIRST, takes the place of the frame's own.
     """
     if frame.scan in (Scan.TOP, Scan.BOTTOM):
         # The fields of one frame follow each other and share its number.
-        second = frame.scan is Scan.TOP
+        second = frame.scan is (Scan.BOTTOM if order is Scan.TOP_FIRST else Scan.TOP)
         return (_picture(frame, 2 * frame.seq + second, frame.scan, frame.t_ns, alone=True),)
     if sampling == "frame" or not frame.scan.interlaced:
         return (_picture(frame, frame.seq, frame.scan, frame.t_ns, alone=True),)
-    order = (Scan.TOP, Scan.BOTTOM) if frame.scan is Scan.TOP_FIRST else (Scan.BOTTOM, Scan.TOP)
+    top_first = (order or frame.scan) is Scan.TOP_FIRST
+    kinds = (Scan.TOP, Scan.BOTTOM) if top_first else (Scan.BOTTOM, Scan.TOP)
     quarter_ns = (frame.period_ns + 2) // 4
     return tuple(
         _picture(frame, 2 * frame.seq + k, scan, frame.t_ns + (2 * k - 1) * quarter_ns, alone=False)
-        for k, scan in enumerate(order)
+        for k, scan in enumerate(kinds)
     )
 
 
@@ -41,4 +43,6 @@ def _picture(frame: Frame, seq: int, scan: Scan, t_ns: int, *, alone: bool) -> P
         row_offset=offset,
         row_step=2 if field else 1,
         damage=frame.damage,
+        exposure_ns=frame.exposure_ns,
+        order_known=frame.order_known,
     )

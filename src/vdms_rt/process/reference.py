@@ -6,49 +6,101 @@ import dataclasses
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
+from vdms_rt.measure.centroid import otsu_circle, otsu_semi_axes
+from vdms_rt.measure.expect import first_look
+from vdms_rt.measure.gate import Workspace
 from vdms_rt.measure.homography import homography
+from vdms_rt.measure.smooth import CircleReading, first_slow, measure
 from vdms_rt.measure.still import is_still, noise_px
-from vdms_rt.model import UNUSABLE_CIRCLE, Circle, Event, Picture, Severity, VdmsError
-from vdms_rt.process.progress import Phase, Progress, references_of
-from vdms_rt.setup import MarkerSetUp, SetUp
+from vdms_rt.measure.validity import learn
+from vdms_rt.model import (
+    UNUSABLE_CIRCLE,
+    Circle,
+    CircleFlag,
+    Event,
+    Picture,
+    Region,
+    Scan,
+    Severity,
+    VdmsError,
+)
+from vdms_rt.process.progress import Phase, Progress, Still, watches_of
+from vdms_rt.setup import FieldSetUp, MarkerSetUp, SetUp
 
 LOST_S = 1.0
 """A marker that is not in its regions for so long before the reference is searched anew."""
 
 
 def gather(
-    progress: Progress, picture: Picture, circles: tuple[tuple[Circle, ...], ...]
-) -> tuple[Progress, tuple[Event, ...]]:
-    every = [c for marker in circles for c in marker]
-    if any(c.flags & UNUSABLE_CIRCLE for c in every):
-        return _interrupted(progress, picture)
+    progress: Progress, picture: Picture, work: Workspace
+) -> tuple[Progress, tuple[tuple[Circle, ...], ...], tuple[Event, ...]]:
+    """Return the run after one more picture before the reference, each marker's circles in it, and
+    events. With enough pictures of a resting marker, this takes or checks the reference."""
+    progress, still = _look(progress, picture, work)
+    circles = _by_marker(progress, still.circles)
+    if any(c.flags & UNUSABLE_CIRCLE for c in still.circles):
+        progress, events = _interrupted(progress, picture)
+        return progress, circles, events
+    kinds = {s.kind for s in progress.stills} | {still.kind}
+    if picture.row_step == 2:
+        kinds |= {Scan.TOP, Scan.BOTTOM}
     count = progress.plan.reference_pictures
-    centres = np.array([(c.x_px, c.y_px) for c in every])
-    stills = (*progress.stills, centres)[-count:]
-    readings = (*progress.readings, tuple(every))[-count:]
-    progress = dataclasses.replace(progress, stills=stills, readings=readings, lost_since_ns=None)
-    if len(stills) < count:
-        return progress, ()
-    if not is_still(np.array(stills), progress.plan.still_px):
-        if progress.waiting:
-            return progress, ()
-        text = "the marker moves; the reference is taken as soon as it rests"
-        return (
-            dataclasses.replace(progress, waiting=True),
-            (Event(Severity.INFO, "waiting-for-still", text),),
-        )
-    if progress.phase is Phase.CHECKING:
-        return _checked(progress)
-    return _referenced(progress, picture)
+    stills = (*progress.stills, still)[-count * len(kinds) :]
+    progress = dataclasses.replace(progress, stills=stills, lost_since_ns=None)
+    by_kind = {k: [s for s in stills if s.kind is k] for k in sorted(kinds)}
+    if any(len(same) < count for same in by_kind.values()):
+        return progress, circles, ()
+    if not all(is_still(_centres(same), progress.plan.still_px) for same in by_kind.values()):
+        progress, events = _moving(progress)
+    elif progress.phase is Phase.CHECKING:
+        progress, events = _checked(progress, by_kind)
+    else:
+        progress, events = _referenced(progress, picture, by_kind)
+    return progress, circles, events
+
+
+def _look(progress: Progress, picture: Picture, work: Workspace) -> tuple[Progress, Still]:
+    circles: list[Circle] = []
+    readings: list[tuple[CircleReading, ...]] = []
+    slow = progress.slow
+    for n, (shape, regions) in enumerate(zip(progress.plan.shapes, progress.regions, strict=True)):
+        rows = (picture.row_offset, picture.row_step)
+        own = [otsu_circle(picture.image, r, shape.white_on_black, *rows) for r in regions]
+        if progress.plan.method == "smooth" and not any(c.flags & UNUSABLE_CIRCLE for c in own):
+            expected = first_look(
+                tuple((c.x_px, c.y_px) for c in own),
+                tuple(
+                    otsu_semi_axes(picture.image, r, shape.white_on_black, *rows) for r in regions
+                ),
+            )
+            before = slow.get((n, picture.kind)) or first_slow(len(own))
+            seen, _ = measure(picture.image, *rows, expected, before, work)
+            # The slope of light that lies on the discs at rest is theirs: with it expected, it is
+            # not divided out here, as it will not be later.
+            expected = expected._replace(light_per_px=tuple(r.light_per_px for r in seen))
+            seen, after = measure(picture.image, *rows, expected, before, work)
+            slow = {**slow, (n, picture.kind): after}
+            readings.append(tuple(seen))
+            own = [circle_of(r, CircleFlag.NONE) for r in seen]
+        circles += own
+    still = Still(
+        picture.kind, picture.row_offset, picture.row_step, tuple(circles), tuple(readings)
+    )
+    return dataclasses.replace(progress, slow=slow), still
+
+
+def circle_of(reading: CircleReading, flags: CircleFlag) -> Circle:
+    """Return a reading as a sample carries it."""
+    return Circle(reading.x_px, reading.y_px, reading.area_px, abs(reading.contrast), flags)
 
 
 def _interrupted(progress: Progress, picture: Picture) -> tuple[Progress, tuple[Event, ...]]:
     since = progress.lost_since_ns if progress.lost_since_ns is not None else picture.t_ns
-    progress = dataclasses.replace(progress, stills=(), readings=(), lost_since_ns=since)
-    lost_ns = picture.t_ns - since
+    progress = dataclasses.replace(progress, stills=(), lost_since_ns=since)
     searchable = progress.phase is Phase.STILLS and not all(progress.plan.regions)
-    if lost_ns < LOST_S * 1e9 or not searchable:
+    if picture.t_ns - since < LOST_S * 1e9 or not searchable:
         return progress, ()
     event = Event(
         Severity.WARNING, "marker-lost", "the marker left its regions before the reference"
@@ -59,11 +111,24 @@ def _interrupted(progress: Progress, picture: Picture) -> tuple[Progress, tuple[
     )
 
 
-def _checked(progress: Progress) -> tuple[Progress, tuple[Event, ...]]:
+def _moving(progress: Progress) -> tuple[Progress, tuple[Event, ...]]:
+    if progress.waiting:
+        return progress, ()
+    text = "the marker moves; the reference is taken as soon as it rests"
+    return (
+        dataclasses.replace(progress, waiting=True),
+        (Event(Severity.INFO, "waiting-for-still", text),),
+    )
+
+
+def _checked(
+    progress: Progress, by_kind: dict[Scan, list[Still]]
+) -> tuple[Progress, tuple[Event, ...]]:
     assert progress.set_up is not None
+    now = np.mean([_centres(same).mean(axis=0) for same in by_kind.values()], axis=0)
     reference = np.array([p for m in progress.set_up.markers for p in m.reference_px])
-    moved_px = float(np.abs(np.mean(progress.stills, axis=0) - reference).max())
-    progress = dataclasses.replace(progress, stills=(), readings=(), waiting=False)
+    moved_px = float(np.abs(now - reference).max())
+    progress = dataclasses.replace(progress, stills=(), waiting=False)
     if moved_px <= progress.plan.stale_px:
         text = (
             f"the stored set-up, revision {progress.revision}, holds: "
@@ -82,58 +147,116 @@ def _checked(progress: Progress) -> tuple[Progress, tuple[Event, ...]]:
     )
 
 
-def _referenced(progress: Progress, picture: Picture) -> tuple[Progress, tuple[Event, ...]]:
-    stills = np.array(progress.stills)
-    mean_px = stills.mean(axis=0)
-    area = np.mean([[c.area_px for c in r] for r in progress.readings], axis=0)
-    contrast = np.mean([[c.contrast for c in r] for r in progress.readings], axis=0)
+def _referenced(
+    progress: Progress, picture: Picture, by_kind: dict[Scan, list[Still]]
+) -> tuple[Progress, tuple[Event, ...]]:
     markers = []
-    at = 0
-    for shape, regions in zip(progress.plan.shapes, progress.regions, strict=True):
-        own = slice(at, at + len(regions))
-        at += len(regions)
+    first = 0
+    for n, (shape, regions) in enumerate(zip(progress.plan.shapes, progress.regions, strict=True)):
+        own = slice(first, first + len(regions))
+        first += len(regions)
         try:
-            h = homography(np.array(shape.circles_mm), mean_px[own])
+            markers.append(_marker(progress, n, own, by_kind))
         except VdmsError as error:
             event = Event(Severity.WARNING, "no-homography", f"marker {shape.name}: {error}")
-            return dataclasses.replace(progress, stills=(), readings=()), (event,)
-        noise = noise_px(stills[:, own])
-        markers.append(
-            MarkerSetUp(
-                shape=shape,
-                regions=regions,
-                reference_px=tuple((float(x), float(y)) for x, y in mean_px[own]),
-                area_px=tuple(float(a) for a in area[own]),
-                contrast=tuple(float(c) for c in contrast[own]),
-                noise_px=0.0 if math.isnan(noise) else noise,
-                homography=h.tolist(),
-            )
-        )
+            return dataclasses.replace(progress, stills=()), (event,)
+    count = progress.plan.reference_pictures
     set_up = SetUp(
         revision=progress.revision + 1,
         utc_ns=picture.utc_ns,
         width_px=progress.width_px,
         height_px=progress.height_px,
-        scan=picture.scan,
+        scan=frame_scan(picture),
         method=progress.plan.method,
-        stills=len(stills),
+        stills=count * len(by_kind),
         markers=tuple(markers),
     )
-    event = Event(
-        Severity.INFO,
-        "reference",
-        f"reference taken from {len(stills)} pictures, set-up revision {set_up.revision}",
-    )
+    text = f"reference taken from {set_up.stills} pictures, set-up revision {set_up.revision}"
     return (
         dataclasses.replace(
             progress,
             phase=Phase.MEASURING,
             set_up=set_up,
-            references=references_of(set_up),
+            watches=watches_of(set_up, picture.exposure_ns, picture.period_ns * picture.row_step),
             revision=set_up.revision,
             stills=(),
-            readings=(),
             waiting=False,
         ),
-        (event,),
+        (Event(Severity.INFO, "reference", text),),
+    )
+
+
+def _marker(
+    progress: Progress, n: int, own: slice, by_kind: dict[Scan, list[Still]]
+) -> MarkerSetUp:
+    """Return marker number n, whose circles are `own`. Raises VdmsError if they do not make a
+    homography."""
+    fields = []
+    noises = []
+    for kind, same in by_kind.items():
+        centres = _centres(same)[:, own]
+        noises.append(noise_px(centres))
+        reference = [(float(x), float(y)) for x, y in centres.mean(axis=0)]
+        appearance = limits = None
+        if progress.plan.method == "smooth":
+            appearance, limits = learn(
+                [s.readings[n] for s in same],
+                progress.slow[n, kind],
+                same[0].row_offset,
+                same[0].row_step,
+            )
+            reference = list(zip(appearance.x_px, appearance.y_px, strict=True))
+        circles = [s.circles[own] for s in same]
+        fields.append(
+            FieldSetUp(
+                kind=kind,
+                reference_px=tuple(reference),
+                area_px=tuple(np.mean([[c.area_px for c in p] for p in circles], axis=0).tolist()),
+                contrast=tuple(
+                    np.mean([[c.contrast for c in p] for p in circles], axis=0).tolist()
+                ),
+                appearance=appearance,
+                limits=limits,
+            )
+        )
+    shape = progress.plan.shapes[n]
+    mean_px = np.mean([f.reference_px for f in fields], axis=0)
+    noise = math.sqrt(np.mean(np.square(noises)))
+    return MarkerSetUp(
+        shape=shape,
+        regions=progress.regions[n],
+        noise_px=0.0 if math.isnan(noise) else noise,
+        homography=homography(np.array(shape.circles_mm), mean_px).tolist(),
+        fields=tuple(fields),
+    )
+
+
+def frame_scan(picture: Picture) -> Scan:
+    """Return the scan of the frame that a picture is of: of a field, the order in use."""
+    if picture.kind is Scan.PROGRESSIVE:
+        return picture.scan
+    first = picture.seq % 2 == 0
+    return Scan.TOP_FIRST if first == (picture.scan is Scan.TOP) else Scan.BOTTOM_FIRST
+
+
+def _centres(stills: list[Still]) -> NDArray[np.float64]:
+    """Return all circles' centres, (pictures, circles, 2)."""
+    return np.array([[(c.x_px, c.y_px) for c in s.circles] for s in stills])
+
+
+def _by_marker(progress: Progress, circles: tuple[Circle, ...]) -> tuple[tuple[Circle, ...], ...]:
+    out = []
+    first = 0
+    for regions in progress.regions:
+        out.append(circles[first : first + len(regions)])
+        first += len(regions)
+    return tuple(out)
+
+
+def region_at(region: Region, centre_px: tuple[float, float]) -> Region:
+    """Return the region moved so that its middle is at a point."""
+    return dataclasses.replace(
+        region,
+        x_px=round(centre_px[0] - (region.width_px - 1) / 2),
+        y_px=round(centre_px[1] - (region.height_px - 1) / 2),
     )

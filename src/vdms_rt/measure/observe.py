@@ -1,0 +1,131 @@
+"""One marker in one picture: its circles' centres, which of them to trust, and its motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vdms_rt.measure.expect import Expected
+from vdms_rt.measure.gate import Workspace
+from vdms_rt.measure.homography import Matrix, jacobian_mm_per_px, to_marker_mm
+from vdms_rt.measure.radial import edge_fit
+from vdms_rt.measure.rigid import Covariances, Motion, agreeing_motion
+from vdms_rt.measure.smooth import CircleReading, Slow, measure
+from vdms_rt.measure.validity import Limits, judge
+from vdms_rt.model import UNUSABLE_CIRCLE, CircleFlag, Luma, Points
+
+MISFIT_LIMIT = 4.5
+"""Standard deviations; with two coordinates a good circle exceeds them once in 25 000 times."""
+NEAR_PX = 1.0
+FAR_PX = 3.0
+"""How well a disturbed circle's place is known with and without other circles in the picture."""
+
+
+def observe(
+    image: Luma,
+    row_offset: int,
+    row_step: int,
+    expected: Expected,
+    limits: Limits,
+    slow: Slow,
+    work: Workspace,
+    frame_height_px: int,
+) -> tuple[list[CircleReading], list[CircleFlag], Slow]:
+    """Return a marker's circles in one picture, their flags, and the next slow figures.
+
+    `image` is as for `smooth.measure`. A circle whose look is wrong is measured by what is left of
+    its edge: if that succeeds it is REFITTED and may be used, else it keeps the flags that say what
+    is wrong.
+    """
+    readings, later = measure(image, row_offset, row_step, expected, slow, work)
+    noise_grey = slow.variance_grey2**0.5
+    flags = judge(readings, expected, limits, noise_grey, image.shape[1], frame_height_px)
+    for flag in flags:
+        if flag is not CircleFlag.NONE:
+            _refit(image, row_offset, row_step, expected, limits, slow, readings, flags)
+            break
+    return readings, flags, later
+
+
+def _refit(
+    image: Luma,
+    row_offset: int,
+    row_step: int,
+    expected: Expected,
+    limits: Limits,
+    slow: Slow,
+    readings: list[CircleReading],
+    flags: list[CircleFlag],
+) -> None:
+    good = [k for k, flag in enumerate(flags) if not flag & UNUSABLE_CIRCLE]
+    off_x = off_y = 0.0
+    if good:
+        off_x = sum(readings[k].x_px - expected.x_px[k] for k in good) / len(good)
+        off_y = sum(readings[k].y_px - expected.y_px[k] for k in good) / len(good)
+    for k, flag in enumerate(flags):
+        if not flag & UNUSABLE_CIRCLE:
+            continue
+        way_x, way_y = expected.blur_px[k]
+        edge_x, edge_y = slow.edge_px[k]
+        fit = edge_fit(
+            image,
+            row_offset,
+            row_step,
+            (expected.x_px[k] + off_x, expected.y_px[k] + off_y),
+            expected.moments_px2[k],
+            ((edge_x**2 + way_x**2 / 12) ** 0.5, (edge_y**2 + way_y**2 / 12) ** 0.5),
+            limits.contrast_grey[k],
+            slow.variance_grey2,
+            NEAR_PX if good else FAR_PX,
+        )
+        if fit is not None:
+            readings[k] = fit
+            flags[k] = CircleFlag.REFITTED | (flag & CircleFlag.SATURATED)
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One marker's motion in one picture."""
+
+    motion: Motion | None
+    """None with fewer than three usable circles."""
+    flags: tuple[CircleFlag, ...]
+    agree: bool
+    """False when the usable circles contradict each other and nobody can say which is wrong."""
+    now_mm: Points
+    """The circles in the marker plane, (n, 2)."""
+    covariance_mm2: Covariances
+
+
+def motion_of(
+    readings: Sequence[CircleReading],
+    flags: Sequence[CircleFlag],
+    h: Matrix,
+    reference_mm: Points,
+    tolerance_mm: float = 0.0,
+) -> Observation:
+    """Return the marker's motion from its usable circles.
+
+    Circles that contradict the others get the flag RESIDUAL and are not used. `tolerance_mm` is how
+    far a circle may be off for other reasons than noise: what the lens bends between the place at
+    rest and here.
+    """
+    centres = np.array([(r.x_px, r.y_px) for r in readings])
+    now_mm = to_marker_mm(h, centres)
+    covariance_px2 = np.array(
+        [((xx, xy), (xy, yy)) for xx, xy, yy in (r.covariance_px2 for r in readings)]
+    )
+    jacobian = jacobian_mm_per_px(h, centres)
+    covariance_mm2 = jacobian @ covariance_px2 @ jacobian.transpose(0, 2, 1)
+    good = np.array([not flag & UNUSABLE_CIRCLE for flag in flags])
+    motion, agree = agreeing_motion(
+        reference_mm, now_mm, covariance_mm2, good, MISFIT_LIMIT, tolerance_mm
+    )
+    marked = list(flags)
+    if motion is not None:
+        for k, (usable, used) in enumerate(zip(good.tolist(), motion.used, strict=True)):
+            if usable and not used:
+                marked[k] |= CircleFlag.RESIDUAL
+    return Observation(motion, tuple(marked), agree, now_mm, covariance_mm2)

@@ -1,0 +1,199 @@
+"""Which circles to trust: readings against what this picture should show, within learnt limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vdms_rt.measure.expect import Appearance, Expected, raster
+from vdms_rt.measure.gate import Shape
+from vdms_rt.measure.smooth import CircleReading, Slow
+from vdms_rt.model import CircleFlag
+
+LEAST_CONTRAST = 0.5
+"""Of the contrast at rest."""
+LOST_CONTRAST = 0.15
+FAR_AREA = 0.06
+"""By how much all circles together may be larger or smaller than expected: the focus breathes."""
+FLOOR = 0.0015
+"""Least limit of every ratio: what perspective, pixels and weights leave unexplained."""
+PER_PIXEL = 1e-4
+"""What a pixel of way from the place at rest adds to a limit: a lens that bends the corner by 1 %
+of its radius changes an area by this much."""
+DEVIATIONS = 6.0
+"""Scatter of the stills that a limit allows."""
+BLUR_SHARE = 0.015
+"""Of the square of the way in the exposure: how far the moment that motion adds is known, which is
+a third of it."""
+FULL_GREY = 254.0
+
+_FLAGS = tuple(CircleFlag(bits) for bits in range(512))
+_LOST, _BORDER, _CONTRAST, _AREA, _FILL, _MOMENT, _SATURATED = (
+    int(flag)
+    for flag in (
+        CircleFlag.LOST,
+        CircleFlag.BORDER,
+        CircleFlag.CONTRAST,
+        CircleFlag.AREA,
+        CircleFlag.FILL,
+        CircleFlag.MOMENT,
+        CircleFlag.SATURATED,
+    )
+)
+_FOUR_PI = 4 * math.pi
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How far a circle's ratio to what is expected may lie from 1: plain numbers, tuples over the
+    circles, learnt from the stills of the reference. Part of the set-up."""
+
+    area: tuple[float, ...]
+    """Against the middle of all circles' ratios: focus and light change all of them alike."""
+    fill: tuple[float, ...]
+    """Area over that of the ellipse with the same second moments."""
+    moment: tuple[float, ...]
+    """Second moments over the area."""
+    contrast_grey: tuple[float, ...]
+    """Contrast at rest, negative for a dark disc."""
+
+
+def learn(
+    stills: Sequence[Sequence[CircleReading]], slow: Slow, row_offset: int, row_step: int
+) -> tuple[Appearance, Limits]:
+    """Return how the circles look at rest and how far that varies, from the readings of a resting
+    marker, picture by picture, all of one kind (whole, or one field).
+
+    The readings must have been taken with no raster expected (as by `first_look`); it is worked out
+    here and taken off the means. `slow` is the state after the last of them. Raises ValueError
+    without any.
+    """
+    if not stills:
+        raise ValueError("no stills: at least one reading of the resting marker is needed")
+    table = np.array([[_figures(r) for r in picture] for picture in stills])
+    mean = table.mean(axis=0)
+    scatter = np.zeros_like(mean)
+    if len(table) > 1:
+        # Of successive differences: a slow drift of the light is not noise.
+        scatter = np.sqrt(np.mean(np.diff(table, axis=0) ** 2, axis=0) / 2)
+    columns: list[list[float]] = mean.T.tolist()
+    x, y, area = columns[:3]
+    shapes: list[Shape] = []
+    for k, edge in enumerate(slow.edge_px):
+        xx, xy, yy = columns[3][k], columns[4][k], columns[5][k]
+        shape = (xx, xy, yy)
+        seen_y = y[k]
+        for _ in range(3):
+            phase = 2 * math.pi * (y[k] - row_offset) / row_step
+            wave = raster(shape, edge, row_step)
+            y[k] = seen_y - wave.y_px * math.sin(phase)
+            shape = (xx, xy, yy - wave.yy_px2 * math.cos(phase))
+        x[k] -= xy / yy * (seen_y - y[k])
+        area[k] /= 1 + wave.area * math.cos(phase)
+        shapes.append(shape)
+    appearance = Appearance(
+        row_step=row_step,
+        x_px=tuple(x),
+        y_px=tuple(y),
+        area_px=tuple(area),
+        moments_px2=tuple(shapes),
+        disc_grey=tuple(columns[6]),
+        ground_grey=tuple(columns[7]),
+        light_per_px=tuple(zip(columns[8], columns[9], strict=True)),
+        variance_grey2=slow.variance_grey2,
+        edge_px=slow.edge_px,
+    )
+    limits = FLOOR + DEVIATIONS * scatter[:, 10:13]
+    return appearance, Limits(
+        area=tuple((FLOOR + DEVIATIONS * scatter[:, 2] / mean[:, 2]).tolist()),
+        fill=tuple(limits[:, 0].tolist()),
+        moment=tuple(limits[:, 1:].max(axis=1).tolist()),
+        contrast_grey=tuple((mean[:, 6] - mean[:, 7]).tolist()),
+    )
+
+
+def _figures(r: CircleReading) -> tuple[float, ...]:
+    xx, xy, yy = r.moments_px2
+    fill = r.area_px / (_FOUR_PI * math.sqrt(max(xx * yy - xy * xy, 1e-9)))
+    per_area = _FOUR_PI / r.area_px
+    return (
+        *(r.x_px, r.y_px, r.area_px),
+        *r.moments_px2,
+        *(r.disc_grey, r.ground_grey),
+        *r.light_per_px,
+        *(fill, xx * per_area, yy * per_area),
+    )
+
+
+def judge(
+    readings: Sequence[CircleReading],
+    expected: Expected,
+    limits: Limits,
+    noise_grey: float,
+    width_px: int,
+    height_px: int,
+) -> list[CircleFlag]:
+    """Return the flags of each circle of a marker in one picture of a frame of that size."""
+    ratios = [r[2] / area for r, area in zip(readings, expected.area_px, strict=True)]
+    ranked = sorted(ratios)
+    middle = (ranked[(len(ranked) - 1) // 2] + ranked[len(ranked) // 2]) / 2
+    if not -FAR_AREA < middle - 1 < FAR_AREA:
+        middle = 1.0
+    full = FULL_GREY - 2 * noise_grey
+    last_x, last_y = width_px - 1, height_px - 1
+    flags = []
+    for (
+        (x, y, _, (xx, xy, yy), disc, ground, (light_x, light_y), _),
+        ratio,
+        (exx, exy, eyy),
+        (way_x, way_y),
+        travel,
+        (reach_x, reach_y),
+        area_limit,
+        fill_limit,
+        moment_limit,
+        contrast,
+    ) in zip(
+        readings,
+        ratios,
+        expected.moments_px2,
+        expected.blur_px,
+        expected.travel_px,
+        expected.reach_px,
+        limits.area,
+        limits.fill,
+        limits.moment,
+        limits.contrast_grey,
+        strict=True,
+    ):
+        bits = 0
+        part = (disc - ground) / contrast
+        if part < LEAST_CONTRAST:
+            bits = _CONTRAST if part > LOST_CONTRAST else _CONTRAST | _LOST
+        bent = PER_PIXEL * travel
+        blur_x, blur_y = BLUR_SHARE * way_x * way_x, BLUR_SHARE * way_y * way_y
+        blur = blur_x + blur_y
+        smear = blur / eyy
+        if abs(ratio / middle - 1) > area_limit + bent + smear:
+            bits |= _AREA
+        det, edet = xx * yy - xy * xy, exx * eyy - exy * exy
+        fill = (ratio * ratio * edet / det - 1) / 2 if det > 0 else 1.0
+        if abs(fill) > fill_limit + smear:
+            bits |= _FILL
+        slack = moment_limit + bent
+        if (
+            abs(xx / ratio - exx) > slack * exx + blur_x
+            or abs(yy / ratio - eyy) > slack * eyy + blur_y
+            or abs(xy / ratio - exy) > (slack * (exx + eyy) + blur) / 4
+        ):
+            bits |= _MOMENT
+        brightest = disc + abs(disc) * (abs(light_x * reach_x) + abs(light_y * reach_y))
+        if brightest > full or ground > full:
+            bits |= _SATURATED
+        if not (reach_x <= x <= last_x - reach_x and reach_y <= y <= last_y - reach_y):
+            bits |= _BORDER
+        flags.append(_FLAGS[bits])
+    return flags
