@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import json
 import logging
 import queue
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import zenoh
@@ -71,10 +73,9 @@ class Link:
     the publisher keeps from before it has come.
     """
 
-    def __init__(self, endpoint: str, key: str, history: bool, inbox: Inbox) -> None:
+    def __init__(self, endpoint: str, keys: Sequence[str], inbox: Inbox) -> None:
         self.endpoint = endpoint
-        self._key = key
-        self._history = history
+        self._keys = tuple(keys)
         self._inbox = inbox
         self._session: zenoh.Session | None = None
         self._cancel = zenoh.CancellationToken()
@@ -136,18 +137,23 @@ class Link:
     def _serve(self, session: zenoh.Session) -> None:
         # The interpreter's exit hangs on a zenoh callback that is still declared, so all are
         # undeclared here, in order. They run in zenoh's own thread: they only fill the inbox.
-        with (
-            session,
-            ext.declare_advanced_subscriber(
-                session,
-                self._key,
-                Callback(self._on_sample, indirect=False),
-                recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-            ),
-            session.liveliness().declare_subscriber(
-                _alive_key(self._key), Callback(self._on_alive, indirect=False), history=True
-            ),
-        ):
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(session)
+            for key in {_alive_key(key) for key in self._keys}:
+                stack.enter_context(
+                    session.liveliness().declare_subscriber(
+                        key, Callback(self._on_alive, indirect=False), history=True
+                    )
+                )
+            for key in self._keys:
+                stack.enter_context(
+                    ext.declare_advanced_subscriber(
+                        session,
+                        key,
+                        Callback(self._on_sample, indirect=False),
+                        recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+                    )
+                )
             self._session = session
             while (request := self._requests.get()) is not None:
                 self._fetch(session, request)
@@ -155,7 +161,7 @@ class Link:
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         raw = _raw(sample)
-        if not (self._history and raw.sequenced):
+        if not raw.sequenced:
             self._inbox.put(raw)
             return
         with self._lock:
@@ -181,9 +187,9 @@ class Link:
             self._inbox.put(Left(station))
             return
         self._inbox.put(Arrived(station))
-        if self._history:
+        for key in self._keys:
             # The last message of each topic that has no numbers.
-            self._requests.put(_Request(f"{self._key}/@adv/pub/*/uhlc/**", ""))
+            self._requests.put(_Request(f"{key}/@adv/pub/*/uhlc/**", ""))
 
     def _fetch(self, session: zenoh.Session, request: _Request) -> None:
         try:

@@ -49,10 +49,12 @@ class Missed:
         return self.last_seq - self.first_seq + 1
 
     def __str__(self) -> str:
-        return (
-            f"{self.station}/{self.marker}: missed seq {self.first_seq} to {self.last_seq} "
-            f"({self.count} samples, {self.on_the_way} of them on the way)"
+        many = f"{self.count} samples, seq {self.first_seq} to {self.last_seq}"
+        text = many if self.count > 1 else f"1 sample, seq {self.first_seq}"
+        where = {0: "lost by the station", self.count: "lost on the way"}.get(
+            self.on_the_way, f"{self.on_the_way} of them lost on the way"
         )
+        return f"{self.station}/{self.marker}: missed {text}, {where}"
 
 
 @dataclass(frozen=True, slots=True)

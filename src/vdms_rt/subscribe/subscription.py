@@ -157,38 +157,34 @@ class Listener:
 
 @overload
 def subscribe(
-    key: str = ...,
+    key: str | Sequence[str] = ...,
     connect: str | Sequence[str] = ...,
     *,
-    history: bool = ...,
     queue: int = ...,
     notices: Literal[False] = ...,
     on_notice: Callable[[Notice], object] | None = ...,
 ) -> Subscription[Sample]: ...
 @overload
 def subscribe(
-    key: str = ...,
+    key: str | Sequence[str] = ...,
     connect: str | Sequence[str] = ...,
     *,
-    history: bool = ...,
     queue: int = ...,
     notices: Literal[True],
 ) -> Subscription[Sample | Notice]: ...
 @overload
 def subscribe(
-    key: str = ...,
+    key: str | Sequence[str] = ...,
     connect: str | Sequence[str] = ...,
     *,
-    history: bool = ...,
     queue: int = ...,
     on_sample: Callable[[Sample], object],
     on_notice: Callable[[Notice], object] | None = ...,
 ) -> Listener: ...
 def subscribe(
-    key: str = "vdms/*/*/displacement",
+    key: str | Sequence[str] = "vdms/*/*/displacement",
     connect: str | Sequence[str] = DEFAULT_ENDPOINT,
     *,
-    history: bool = True,
     queue: int = QUEUE,
     notices: bool = False,
     on_sample: Callable[[Sample], object] | None = None,
@@ -196,9 +192,9 @@ def subscribe(
 ) -> Subscription[Any] | Listener:
     """Return the messages under `key` as something to iterate, or call `on_sample` with each.
 
-    `connect` is a station's or a router's address, or one for each of several stations. With
-    `history` there come first the samples that the station keeps from before the subscription
-    (a minute, unless its `publish.recover_s` says otherwise), its last health and set-up. Up to
+    `key` is one zenoh key expression or several; `connect` is a station's or a router's address,
+    or one for each of several stations. First come the samples that the station keeps from
+    before the subscription (a minute, unless its `publish.recover_s` says otherwise). Up to
     `queue` samples wait for a program that is slow; then the newest are dropped, and told as
     missed.
 
@@ -212,15 +208,17 @@ def subscribe(
     for endpoint in endpoints:
         if fault := endpoint_fault(endpoint):
             raise SubscribeError(f"subscribe: {fault}")
-    try:
-        zenoh.KeyExpr(key)
-    except zenoh.ZError as error:
-        raise SubscribeError(
-            f'subscribe: "{key}" is not a key: {reason(error)}; '
-            'write for example "vdms/*/*/displacement"'
-        ) from None
+    keys = (key,) if isinstance(key, str) else tuple(key)
+    for one in keys:
+        try:
+            zenoh.KeyExpr(one)
+        except zenoh.ZError as error:
+            raise SubscribeError(
+                f'subscribe: "{one}" is not a key: {reason(error)}; '
+                'write for example "vdms/*/*/displacement"'
+            ) from None
     inbox = Inbox(queue)
-    links = [Link(endpoint, key, history, inbox) for endpoint in endpoints]
+    links = [Link(endpoint, keys, inbox) for endpoint in endpoints]
     subscription: Subscription[Any] = Subscription(inbox, links, notices, on_notice)
     return subscription if on_sample is None else Listener(subscription, on_sample)
 
