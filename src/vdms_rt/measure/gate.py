@@ -82,6 +82,9 @@ class Gate:
         deepest = -float(distance.min(axis=(1, 2)).max())
         disc = np.all(distance < -min(margin_px, 0.6 * deepest), axis=0)
         ground = np.all(distance > margin_px + 0.5, axis=0)
+        if not ground.any():
+            nearest = distance.min(axis=0)
+            ground = nearest >= nearest.max() - 1
         self.on_disc: NDArray[np.bool_] = disc
         self.on_ground: NDArray[np.bool_] = ground
         """The zones that are flat in every box, (height, width)."""
@@ -158,7 +161,7 @@ class Workspace:
         self.table = np.zeros(65536, np.float32)
         """Weights, a block of 256 for each zone."""
         self.table[256 * DISC : 256 * EDGE] = 1
-        self._blocks = [(0, 0)] * (256 - EDGE)
+        self._blocks: list[tuple[int, int] | None] = [None] * (256 - EDGE)
 
     def gate(self, shapes: tuple[Shape, ...], margin_px: int, row_step: int) -> Gate:
         key = (shapes, margin_px, row_step)

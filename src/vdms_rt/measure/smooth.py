@@ -96,7 +96,7 @@ def measure(
         )
     if slow.pictures % REFRESH_PICTURES:
         return readings, Slow(variance, slow.edge_px, slow.pictures + 1)
-    return readings, _refreshed(slow, gate, levels)
+    return readings, _refreshed(slow, gate)
 
 
 def _read(
@@ -226,7 +226,7 @@ def _divide_light(
     """
     box = gate.raw[k].astype(np.float64)
     mean, slope_x, slope_y, rest = gate.plane_on_disc(box)
-    if rest > 2 * variance_grey2 + (0.01 * mean) ** 2 or mean < 1:
+    if not (rest <= 2 * variance_grey2 + (0.01 * mean) ** 2 and mean >= 1):
         return
     change_x, change_y = slope_x / mean - at_rest[0], slope_y / mean - at_rest[1]
     light = 1 + change_x * gate.x_px + change_y * gate.y_px
@@ -243,21 +243,46 @@ def _divide_light(
     levels[k] = [ground, disc, slope_x, slope_y]
 
 
-def _refreshed(slow: Slow, gate: Gate, levels: list[list[float]]) -> Slow:
+def study(
+    image: Luma, row_offset: int, row_step: int, expected: Expected, slow: Slow, work: Workspace
+) -> tuple[list[CircleReading], Slow]:
+    """Return what `measure` does, but with the slow figures of this picture alone, of all circles:
+    for the stills from which `validity.learn` learns."""
+    readings, _ = measure(image, row_offset, row_step, expected, slow._replace(pictures=1), work)
+    gate = work.gate(expected.gate, expected.margin_px, row_step)
+    figures = [_slow_figures(gate, k) for k in range(gate.count)]
+    return readings, Slow(
+        sum(variance for variance, _, _ in figures) / len(figures),
+        tuple((x, y) for _, x, y in figures),
+        1,
+    )
+
+
+def _refreshed(slow: Slow, gate: Gate) -> Slow:
     k = slow.pictures // REFRESH_PICTURES % gate.count
-    ground, disc, slope_x, slope_y = levels[k]
-    contrast2 = (disc - ground) ** 2 + 1e-6
+    variance, edge_x, edge_y = _slow_figures(gate, k)
+    edge = list(slow.edge_px)
+    edge[k] = (_drawn(edge[k][0], edge_x, 2.0), _drawn(edge[k][1], edge_y, 2.0))
+    return Slow(_drawn(slow.variance_grey2, variance, 4.0), tuple(edge), slow.pictures + 1)
+
+
+def _drawn(mean: float, value: float, factor: float) -> float:
+    """Return a running mean with one more value. A value that is off by more than `factor` counts
+    as one off by that: a glare or a wire in one picture must not upset the mean of many."""
+    if not mean / factor <= value <= mean * factor:
+        value = mean * factor if value > mean else mean / factor
+    return mean + (value - mean) * _MEMORY
+
+
+def _slow_figures(gate: Gate, k: int) -> tuple[float, float, float]:
+    """Return the variance of the noise in grey^2 and the widths of the edge along x and y in px, of
+    circle k in the picture whose boxes the gate holds."""
+    ground, disc, slope_x, slope_y = gate.levels[k].tolist()
     flat = gate.flat_of_each[k].take(gate.disc_pixels)
     flat -= np.float32(disc)
     flat -= np.array([slope_x, slope_y], np.float32) @ gate.disc_plane
-    old = slow.variance_grey2
-    # One picture with a glare or a wire on its circle must not upset the mean of many.
-    variance = min(max(float(np.dot(flat, flat)) / gate.disc_freedom, old / 4), old * 4)
+    variance = float(np.dot(flat, flat)) / gate.disc_freedom
     spread = spread_table(ground, disc).take(gate.raw[k].ravel())
-    width = spread @ gate.edge_weights[k] + variance / contrast2 * gate.edge_offset[k]
-    edge = list(slow.edge_px)
-    edge[k] = tuple(
-        was + (min(max(now, was / 2), was * 2) - was) * _MEMORY
-        for was, now in zip(edge[k], width.tolist(), strict=True)
-    )
-    return Slow(old + (variance - old) * _MEMORY, tuple(edge), slow.pictures + 1)
+    noise = variance / ((disc - ground) ** 2 + 1e-6)
+    x, y = (spread @ gate.edge_weights[k] + noise * gate.edge_offset[k]).tolist()
+    return variance, x, y

@@ -29,6 +29,8 @@ BLUR_SHARE = 0.015
 """Of the square of the way in the exposure: how far the moment that motion adds is known, which is
 a third of it."""
 FULL_GREY = 254.0
+LEAST_EDGE_PX = 0.29
+"""A pixel's own width, as a standard deviation."""
 
 _FLAGS = tuple(CircleFlag(bits) for bits in range(512))
 _LOST, _BORDER, _CONTRAST, _AREA, _FILL, _MOMENT, _SATURATED = (
@@ -62,18 +64,17 @@ class Limits:
 
 
 def learn(
-    stills: Sequence[Sequence[CircleReading]], slow: Slow, row_offset: int, row_step: int
+    stills: Sequence[tuple[Sequence[CircleReading], Slow]], row_offset: int, row_step: int
 ) -> tuple[Appearance, Limits]:
     """Return how the circles look at rest and how far that varies, from the readings of a resting
     marker, picture by picture, all of one kind (whole, or one field).
 
-    The readings must have been taken with no raster expected (as by `first_look`); it is worked out
-    here and taken off the means. `slow` is the state after the last of them. Raises ValueError
-    without any.
+    Each still is what `smooth.study` returned for it, with no raster expected (as by `first_look`):
+    that is worked out here and taken off the means. Raises ValueError without any.
     """
     if not stills:
         raise ValueError("no stills: at least one reading of the resting marker is needed")
-    table = np.array([[_figures(r) for r in picture] for picture in stills])
+    table = np.array([[_figures(r) for r in readings] for readings, _ in stills])
     mean = table.mean(axis=0)
     scatter = np.zeros_like(mean)
     if len(table) > 1:
@@ -82,7 +83,9 @@ def learn(
     columns: list[list[float]] = mean.T.tolist()
     x, y, area = columns[:3]
     shapes: list[Shape] = []
-    for k, edge in enumerate(slow.edge_px):
+    widths = np.array([slow.edge_px for _, slow in stills]).mean(axis=0)
+    edges = tuple((ex, ey) for ex, ey in np.maximum(widths, LEAST_EDGE_PX).tolist())
+    for k, edge in enumerate(edges):
         xx, xy, yy = columns[3][k], columns[4][k], columns[5][k]
         shape = (xx, xy, yy)
         seen_y = y[k]
@@ -103,8 +106,8 @@ def learn(
         disc_grey=tuple(columns[6]),
         ground_grey=tuple(columns[7]),
         light_per_px=tuple(zip(columns[8], columns[9], strict=True)),
-        variance_grey2=slow.variance_grey2,
-        edge_px=slow.edge_px,
+        variance_grey2=float(np.mean([slow.variance_grey2 for _, slow in stills])),
+        edge_px=edges,
     )
     limits = FLOOR + DEVIATIONS * scatter[:, 10:13]
     return appearance, Limits(
@@ -171,23 +174,24 @@ def judge(
     ):
         bits = 0
         part = (disc - ground) / contrast
-        if part < LEAST_CONTRAST:
+        # Asked so that a figure which is not a number is a flag too.
+        if not part >= LEAST_CONTRAST:
             bits = _CONTRAST if part > LOST_CONTRAST else _CONTRAST | _LOST
         bent = PER_PIXEL * travel
         blur_x, blur_y = BLUR_SHARE * way_x * way_x, BLUR_SHARE * way_y * way_y
         blur = blur_x + blur_y
         smear = blur / eyy
-        if abs(ratio / middle - 1) > area_limit + bent + smear:
+        if not abs(ratio / middle - 1) <= area_limit + bent + smear:
             bits |= _AREA
         det, edet = xx * yy - xy * xy, exx * eyy - exy * exy
         fill = (ratio * ratio * edet / det - 1) / 2 if det > 0 else 1.0
-        if abs(fill) > fill_limit + smear:
+        if not abs(fill) <= fill_limit + smear:
             bits |= _FILL
         slack = moment_limit + bent
-        if (
-            abs(xx / ratio - exx) > slack * exx + blur_x
-            or abs(yy / ratio - eyy) > slack * eyy + blur_y
-            or abs(xy / ratio - exy) > (slack * (exx + eyy) + blur) / 4
+        if not (
+            abs(xx / ratio - exx) <= slack * exx + blur_x
+            and abs(yy / ratio - eyy) <= slack * eyy + blur_y
+            and abs(xy / ratio - exy) <= (slack * (exx + eyy) + blur) / 4
         ):
             bits |= _MOMENT
         brightest = disc + abs(disc) * (abs(light_x * reach_x) + abs(light_y * reach_y))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -97,8 +98,8 @@ class Still:
     row_step: int
     circles: tuple[Circle, ...]
     """All markers' circles, one after the other, as the method measured them."""
-    readings: tuple[tuple[CircleReading, ...], ...]
-    """For each marker, with method smooth."""
+    readings: tuple[tuple[Sequence[CircleReading], Slow], ...]
+    """For each marker, with method smooth: what `smooth.study` returned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +118,6 @@ class Progress:
     watches: tuple[Watch, ...] = ()
     revision: int = 0
     stills: tuple[Still, ...] = ()
-    slow: dict[tuple[int, Scan], Slow] = field(default_factory=dict)
-    """While the reference is taken, of (marker, kind)."""
     waiting: bool = False
     """The last pictures are there, but they are not still."""
     lost_since_ns: int | None = None

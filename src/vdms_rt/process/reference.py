@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from vdms_rt.measure.centroid import otsu_circle, otsu_semi_axes
 from vdms_rt.measure.expect import first_look
 from vdms_rt.measure.gate import Workspace
 from vdms_rt.measure.homography import homography
-from vdms_rt.measure.smooth import CircleReading, first_slow, measure
+from vdms_rt.measure.smooth import CircleReading, Slow, first_slow, measure, study
 from vdms_rt.measure.still import is_still, noise_px
 from vdms_rt.measure.validity import learn
 from vdms_rt.model import (
@@ -38,7 +39,7 @@ def gather(
 ) -> tuple[Progress, tuple[tuple[Circle, ...], ...], tuple[Event, ...]]:
     """Return the run after one more picture before the reference, each marker's circles in it, and
     events. With enough pictures of a resting marker, this takes or checks the reference."""
-    progress, still = _look(progress, picture, work)
+    still = _look(progress, picture, work)
     circles = _by_marker(progress, still.circles)
     if any(c.flags & UNUSABLE_CIRCLE for c in still.circles):
         progress, events = _interrupted(progress, picture)
@@ -61,11 +62,10 @@ def gather(
     return progress, circles, events
 
 
-def _look(progress: Progress, picture: Picture, work: Workspace) -> tuple[Progress, Still]:
+def _look(progress: Progress, picture: Picture, work: Workspace) -> Still:
     circles: list[Circle] = []
-    readings: list[tuple[CircleReading, ...]] = []
-    slow = progress.slow
-    for n, (shape, regions) in enumerate(zip(progress.plan.shapes, progress.regions, strict=True)):
+    readings: list[tuple[Sequence[CircleReading], Slow]] = []
+    for shape, regions in zip(progress.plan.shapes, progress.regions, strict=True):
         rows = (picture.row_offset, picture.row_step)
         own = [otsu_circle(picture.image, r, shape.white_on_black, *rows) for r in regions]
         if progress.plan.method == "smooth" and not any(c.flags & UNUSABLE_CIRCLE for c in own):
@@ -75,20 +75,18 @@ def _look(progress: Progress, picture: Picture, work: Workspace) -> tuple[Progre
                     otsu_semi_axes(picture.image, r, shape.white_on_black, *rows) for r in regions
                 ),
             )
-            before = slow.get((n, picture.kind)) or first_slow(len(own))
-            seen, _ = measure(picture.image, *rows, expected, before, work)
+            begin = first_slow(len(own))
+            seen, _ = measure(picture.image, *rows, expected, begin, work)
             # The slope of light that lies on the discs at rest is theirs: with it expected, it is
             # not divided out here, as it will not be later.
             expected = expected._replace(light_per_px=tuple(r.light_per_px for r in seen))
-            seen, after = measure(picture.image, *rows, expected, before, work)
-            slow = {**slow, (n, picture.kind): after}
-            readings.append(tuple(seen))
-            own = [circle_of(r, CircleFlag.NONE) for r in seen]
+            studied = study(picture.image, *rows, expected, begin, work)
+            readings.append(studied)
+            own = [circle_of(r, CircleFlag.NONE) for r in studied[0]]
         circles += own
-    still = Still(
+    return Still(
         picture.kind, picture.row_offset, picture.row_step, tuple(circles), tuple(readings)
     )
-    return dataclasses.replace(progress, slow=slow), still
 
 
 def circle_of(reading: CircleReading, flags: CircleFlag) -> Circle:
@@ -200,10 +198,7 @@ def _marker(
         appearance = limits = None
         if progress.plan.method == "smooth":
             appearance, limits = learn(
-                [s.readings[n] for s in same],
-                progress.slow[n, kind],
-                same[0].row_offset,
-                same[0].row_step,
+                [s.readings[n] for s in same], same[0].row_offset, same[0].row_step
             )
             reference = list(zip(appearance.x_px, appearance.y_px, strict=True))
         circles = [s.circles[own] for s in same]
