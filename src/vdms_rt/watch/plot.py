@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-LABEL_WIDTH = 10
-"""Characters left of the plot: a tick's label and the axis."""
+LABEL_WIDTH = 8
+"""Characters for the ticks' labels; more where they are longer."""
 LONGEST_GAP_S = 0.5
 """Points further apart are not joined."""
 LEAST_SPAN_MM = 0.02
@@ -25,7 +25,7 @@ def plot(
     The scale has round ends, their labels in mm, and spans at least 20 um. The last line is the
     axis of time.
     """
-    columns, rows = max(width - LABEL_WIDTH, 8), max(height - 1, 2)
+    rows = max(height - 1, 2)
     start_s = (points[-1][0] if points else 0.0) - span_s
     shown = [(t_s - start_s, mm) for t_s, mm in points if t_s > start_s]
     low_mm, high_mm, step_mm = scale([mm for _, mm in shown], max(2, min(4, rows // 4)))
@@ -34,6 +34,11 @@ def plot(
     def dot_row(mm: float) -> int:
         return round((high_mm - mm) / (high_mm - low_mm) * bottom)
 
+    labels: dict[int, str] = {}
+    for tick in _ticks(low_mm, high_mm, step_mm):
+        labels.setdefault(dot_row(tick * step_mm) // 4, _label(tick * step_mm, step_mm))
+    label_width = max(LABEL_WIDTH, *map(len, labels.values()))
+    columns = max(width - label_width - 2, 8)
     cells = [[0] * columns for _ in range(rows)]
     last: tuple[float, int, int] | None = None
     for t_s, mm in shown:
@@ -45,15 +50,12 @@ def plot(
         joined = last is not None and t_s - last[0] <= LONGEST_GAP_S
         _line(cells, last[1:] if joined and last else (x, y), (x, y))
         last = t_s, x, y
-    labels: dict[int, str] = {}
-    for tick in _ticks(low_mm, high_mm, step_mm):
-        labels.setdefault(dot_row(tick * step_mm) // 4, _label(tick * step_mm, step_mm))
     lines = [
-        f"{labels.get(row, ''):>{LABEL_WIDTH - 2}} {'┤' if row in labels else '│'}"
+        f"{labels.get(row, ''):>{label_width}} {'┤' if row in labels else '│'}"
         + "".join(chr(_BLANK + bits) for bits in cells[row])
         for row in range(rows)
     ]
-    return [*lines, _time_axis(columns, span_s)]
+    return [*lines, f"{'':{label_width + 1}}└{_time_axis(columns, span_s)}"]
 
 
 def scale(values_mm: Sequence[float], ticks: int) -> tuple[float, float, float]:
@@ -106,4 +108,4 @@ def _time_axis(columns: int, span_s: float) -> str:
     if columns > 3 * len(left) + len(middle):
         start = (columns - len(middle)) // 2
         axis[start : start + len(middle)] = middle
-    return " " * (LABEL_WIDTH - 1) + "└" + "".join(axis)
+    return "".join(axis)
