@@ -6,11 +6,11 @@ import io
 import itertools
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+from reportlab.pdfbase.pdfmetrics import stringWidth
 from reportlab.pdfgen.canvas import Canvas
 
 from vdms_rt.model import MarkerShape, VdmsError
@@ -187,7 +187,8 @@ def svg_bytes(page: Page) -> bytes:
     for mark in page.marks:
         root.append(_element(mark))
     ET.indent(root)
-    return ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    return text + b"\n"
 
 
 def _check(shape: MarkerShape) -> None:
@@ -255,12 +256,13 @@ def _label(shape: MarkerShape, x_mm: float, bottom_mm: float) -> list[Mark]:
     grey = GREY if shape.white_on_black else PALE
     base_mm = bottom_mm - (SHEET_MARGIN / 4) * shape.diameter_mm + 0.35 * size_mm
     text = f"up    vdms-rt {shape.name}    {describe(shape)}"
-    width_mm = 0.5 * size_mm * len(text)
     _, _, sheet_width_mm, _ = _extent(shape)
-    size_mm *= min(1.0, 0.8 * sheet_width_mm / width_mm)
+    per_size = stringWidth(text, "Helvetica", 1) + 1
+    size_mm = min(size_mm, 0.9 * sheet_width_mm / per_size)
+    left_mm = x_mm - size_mm * per_size / 2
     return [
-        *_arrow(x_mm - 0.26 * size_mm * len(text) - 1.2 * size_mm, base_mm, size_mm, grey),
-        Words(x_mm, base_mm, text, size_mm, grey, centred=True),
+        *_arrow(left_mm + 0.4 * size_mm, base_mm, size_mm, grey),
+        Words(left_mm + size_mm, base_mm, text, size_mm, grey),
     ]
 
 
@@ -290,8 +292,8 @@ def _footer(shape: MarkerShape, page_width_mm: float, y_mm: float) -> list[Mark]
     text_mm = x_mm + 36
     lines = (
         describe(shape) + ", scale 1:1",
-        "Print at 100 %, not fitted to the page. Cut along the dashed line, mount it flat, arrow up.",
-        f"Measure this ruler: it must be {RULER_MM}.0 mm long, or every displacement is wrong as much.",
+        "Print at 100 %, not fitted to the page. Cut along the dashed line; mount flat, arrow up.",
+        f"Measure this: it must be {RULER_MM}.0 mm long, or every displacement is wrong as much.",
     )
     words = [Words(text_mm, y_mm + 3 + 4.2 * i, line, 2.8) for i, line in enumerate(lines)]
     return [*_map(shape, x_mm, y_mm, 30.0), *words, *_ruler(text_mm, y_mm + 18)]

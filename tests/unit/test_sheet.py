@@ -1,295 +1,252 @@
-"""The printed page is true to scale, read back by other code than wrote it."""
+"""The printable sheet, read back by other code: pypdf for PDF, an XML parser for SVG."""
+
+from __future__ import annotations
 
 import itertools
 import math
-import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
-from xml.etree import ElementTree
 
+import pypdf
 import pytest
-from pypdf import PdfReader
-from pypdf.generic import ContentStream
 
-from vdms_rt import cli
+from vdms_rt.measure.regions import SHEET_MARGIN
 from vdms_rt.model import MarkerShape
-from vdms_rt.sheet import SheetError, write_sheet
+from vdms_rt.sheet import Paper, SheetError, pdf_bytes, sheet_page, svg_bytes, write_sheet
 
 SVG = "{http://www.w3.org/2000/svg}"
-MM_PER_PT = 25.4 / 72
+POINT_MM = 25.4 / 72
+
+Discs = list[tuple[float, float, float, float]]
+"""(x, y down, diameter, grey) in mm of the page."""
+Boxes = list[tuple[float, float, float, float, float]]
+"""(left, top, width, height, grey) in mm of the page."""
+Strokes = list[tuple[float, float, float, float]]
 
 
-def square(spacing_mm: float, diameter_mm: float, *, white_on_black: bool = True) -> MarkerShape:
+def square(spacing_mm: float, diameter_mm: float, white_on_black: bool = True) -> MarkerShape:
     half = spacing_mm / 2
-    circles = ((-half, half), (half, half), (-half, -half), (half, -half))
-    return MarkerShape("m1", circles, diameter_mm, white_on_black)
+    return MarkerShape(
+        "m1",
+        ((-half, half), (half, half), (-half, -half), (half, -half)),
+        diameter_mm,
+        white_on_black,
+    )
 
 
-class Printed:
-    """What a page shows, in millimetres, x right and y down from the top left corner."""
+DEFAULT = square(120, 50)
+A4 = square(108, 45)
+BLACK_ON_WHITE = square(60.5, 20.25, white_on_black=False)
+ROW = MarkerShape("deck", ((0, 0), (80, 5), (160, -5), (240, 0), (330, 10)), 25)
+SHAPES = [DEFAULT, A4, BLACK_ON_WHITE, ROW, square(1000, 300), square(12, 5)]
 
-    def __init__(self, path: Path) -> None:
-        self.discs: list[tuple[float, float, float, float, str]] = []
-        """Centre x, y, width, height, colour."""
-        self.boxes: list[tuple[float, float, float, float, str]] = []
-        """Left, top, width, height, colour."""
-        self.lines: list[tuple[float, float, float, float, bool]] = []
-        """Ends, sorted, and whether dashed."""
-        self.arrows: list[list[tuple[float, float]]] = []
-        self.text = ""
-        (self._read_pdf if path.suffix == ".pdf" else self._read_svg)(path)
 
-    def _read_svg(self, path: Path) -> None:
-        root = ElementTree.parse(path).getroot()
-        assert root.attrib["width"].endswith("mm")
-        assert root.attrib["height"].endswith("mm")
-        self.size = (float(root.attrib["width"][:-2]), float(root.attrib["height"][:-2]))
-        # One user unit is one millimetre only if the view box is the page.
-        assert [float(v) for v in root.attrib["viewBox"].split()] == [0, 0, *self.size]
-        for item in root:
-            number = {k: float(v) for k, v in item.attrib.items() if re.fullmatch(r"[\d.]+", v)}
-            fill = item.get("fill", "")
-            if item.tag == f"{SVG}circle":
-                d = 2 * number["r"]
-                self.discs.append((number["cx"], number["cy"], d, d, fill))
-            elif item.tag == f"{SVG}rect":
-                box = (number["x"], number["y"], number["width"], number["height"])
-                self.boxes.append((*box, fill))
-            elif item.tag == f"{SVG}line":
-                ends = (number["x1"], number["y1"]), (number["x2"], number["y2"])
-                self._line(ends, dashed="stroke-dasharray" in item.attrib)
-            elif item.tag == f"{SVG}polygon":
-                corners = [tuple(map(float, c.split(","))) for c in item.attrib["points"].split()]
-                self.arrows.append(corners)
-            elif item.tag == f"{SVG}text":
-                self.text += f"{item.text}\n"
+def read_pdf(path: Path) -> tuple[tuple[float, float], Discs, Boxes, Strokes, str]:
+    """Return size, discs, boxes, lines and text of a one-page PDF, in mm with y down."""
+    [page] = pypdf.PdfReader(path).pages
+    height = float(page.mediabox.height)
+    scale = (1.0, 1.0, 0.0, 0.0)
+    discs: Discs = []
+    boxes: Boxes = []
+    strokes: Strokes = []
+    grey = 0.0
+    start = (0.0, 0.0)
+    path_points: list[tuple[float, float]] = []
+    curves = 0
 
-    def _read_pdf(self, path: Path) -> None:
-        reader = PdfReader(path)
-        (page,) = reader.pages
-        self.text = page.extract_text()
-        self.size = (
-            float(page.mediabox.width) * MM_PER_PT,
-            float(page.mediabox.height) * MM_PER_PT,
+    def at(x: float, y: float) -> tuple[float, float]:
+        return (
+            (scale[0] * x + scale[2]) * POINT_MM,
+            (height - scale[1] * y - scale[3]) * POINT_MM,
         )
-        self.print_scaling = reader.root_object["/ViewerPreferences"]["/PrintScaling"]
-        points: list[tuple[float, float]] = []
-        rectangle: tuple[float, ...] = ()
-        curves, fill, dashed = 0, "", False
-        for operands, operator in ContentStream(page.get_contents(), reader).operations:
-            if operator == b"cm":
-                assert [float(v) for v in operands] == [1, 0, 0, 1, 0, 0]
-            elif operator in (b"g", b"rg"):
-                fill = {0.0: "black", 1.0: "white"}[float(operands[0])]
-            elif operator == b"d":
-                dashed = len(operands[0]) > 0
-            elif operator in (b"m", b"l", b"c"):
-                curves += operator == b"c"
-                points.append(self._at(*operands[-2:]))
-            elif operator == b"re":
-                rectangle = tuple(float(v) for v in operands)
-            elif operator == b"S":
-                self._line((points[0], points[1]), dashed=dashed)
-            elif operator in (b"f", b"f*"):
-                self._filled(points, rectangle, curves, fill)
-            if operator in (b"S", b"f", b"f*", b"n"):
-                points, rectangle, curves = [], (), 0
 
-    def _at(self, x: float, y: float) -> tuple[float, float]:
-        return float(x) * MM_PER_PT, self.size[1] - float(y) * MM_PER_PT
-
-    def _filled(
-        self,
-        points: list[tuple[float, float]],
-        rectangle: tuple[float, ...],
-        curves: int,
-        fill: str,
-    ) -> None:
-        if rectangle:
-            x, y, width, height = rectangle
-            left, top = self._at(x, y + height)
-            self.boxes.append((left, top, width * MM_PER_PT, height * MM_PER_PT, fill))
-        elif curves:
-            xs, ys = zip(*points, strict=True)
-            middle = (min(xs) + max(xs)) / 2, (min(ys) + max(ys)) / 2
-            self.discs.append((*middle, max(xs) - min(xs), max(ys) - min(ys), fill))
-        else:
-            self.arrows.append(points)
-
-    def _line(self, ends: tuple[tuple[float, float], ...], *, dashed: bool) -> None:
-        self.lines.append((*min(ends), *max(ends), dashed))
+    for operands, operator in pypdf.generic.ContentStream(page.get_contents(), None).operations:
+        values = [float(v) for v in operands if isinstance(v, (int, float))]
+        match operator.decode():
+            case "cm":
+                a, b, c, d, e, f = values
+                assert (b, c) == (0, 0)
+                scale = (scale[0] * a, scale[1] * d, scale[2] + e, scale[3] + f)
+            case "g":
+                [grey] = values
+            case "re":
+                x, y, width, height_mm = values
+                left, bottom = at(x, y)
+                right, top = at(x + width, y + height_mm)
+                boxes.append((left, top, right - left, bottom - top, grey))
+            case "m":
+                start = at(*values)
+                path_points, curves = [start], 0
+            case "c":
+                path_points.append(at(*values[4:]))
+                curves += 1
+            case "l":
+                path_points.append(at(*values))
+            case "S":
+                strokes.append((*path_points[0], *path_points[1]))
+            case "f" | "f*" if curves == 4:
+                xs, ys = zip(*path_points, strict=True)
+                width, tall = max(xs) - min(xs), max(ys) - min(ys)
+                assert width == pytest.approx(tall, abs=1e-3)
+                discs.append(((max(xs) + min(xs)) / 2, (max(ys) + min(ys)) / 2, width, grey))
+    size = float(page.mediabox.width) * POINT_MM, height * POINT_MM
+    return size, discs, boxes, strokes, page.extract_text()
 
 
-@pytest.fixture(params=["pdf", "svg"])
-def out(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    return tmp_path / f"marker.{request.param}"
+def read_svg(path: Path) -> tuple[tuple[float, float], Discs, Boxes, Strokes, str]:
+    """Return the same of an SVG."""
+    root = ET.fromstring(path.read_bytes())
+    size = tuple(float(root.attrib[side].removesuffix("mm")) for side in ("width", "height"))
+    assert root.attrib["viewBox"] == f"0 0 {size[0]:g} {size[1]:g}"
+
+    def numbers(element: ET.Element, *names: str) -> tuple[float, ...]:
+        return tuple(float(element.attrib[name]) for name in names)
+
+    def grey(element: ET.Element) -> float:
+        return int(element.attrib["fill"][1:3], 16) / 255
+
+    discs = [
+        (x, y, 2 * r, grey(e))
+        for e in root.iter(f"{SVG}circle")
+        for x, y, r in [numbers(e, "cx", "cy", "r")]
+    ]
+    boxes = [
+        (*numbers(e, "x", "y", "width", "height"), grey(e))
+        for e in root.iter(f"{SVG}rect")
+        if "x" in e.attrib
+    ]
+    strokes = [numbers(e, "x1", "y1", "x2", "y2") for e in root.iter(f"{SVG}line")]
+    text = "\n".join(e.text or "" for e in root.iter(f"{SVG}text"))
+    return (size[0], size[1]), discs, boxes, strokes, text  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize("white_on_black", [True, False])
-@pytest.mark.parametrize(("spacing_mm", "diameter_mm"), [(120, 50), (33.3, 12.5), (700, 300)])
-def test_circles_and_sheet_are_true_to_scale(
-    out: Path, spacing_mm: float, diameter_mm: float, white_on_black: bool
-) -> None:
-    shape = square(spacing_mm, diameter_mm, white_on_black=white_on_black)
-    write_sheet(shape, out)
-    printed = Printed(out)
-    ground, disc = ("black", "white") if white_on_black else ("white", "black")
-
-    ((left, top, width, height, fill),) = printed.boxes
-    assert fill == ground
-    assert (width, height) == pytest.approx((spacing_mm + 2 * diameter_mm,) * 2, abs=2e-3)
-    middle = left + width / 2, top + height / 2
-    for seen, (x, y) in zip(printed.discs, shape.circles_mm, strict=True):
-        assert seen[:2] == pytest.approx((middle[0] + x, middle[1] - y), abs=2e-3)
-        assert seen[2:4] == pytest.approx((diameter_mm, diameter_mm), abs=2e-3)
-        assert seen[4] == disc
+READERS = {".pdf": read_pdf, ".svg": read_svg}
 
 
-def test_uneven_marker_keeps_its_handedness(out: Path) -> None:
-    shape = MarkerShape("m1", ((0, 0), (90, 5), (10, 60), (70, 80), (40, 30)), 20)
-    write_sheet(shape, out)
-    seen = [d[:2] for d in Printed(out).discs]
-    moved = [(x - seen[0][0], seen[0][1] - y) for x, y in seen]
-    assert moved == [pytest.approx(c, abs=2e-3) for c in shape.circles_mm]
-    (box,) = Printed(out).boxes
-    assert box[2:4] == pytest.approx((90 + 40, 80 + 40), abs=2e-3)
+@pytest.fixture(params=READERS)
+def reader(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[..., tuple]:  # type: ignore[type-arg]
+    def write_and_read(shape: MarkerShape, paper: Paper = "auto") -> tuple:  # type: ignore[type-arg]
+        path = tmp_path / f"marker{request.param}"
+        write_sheet(shape, path, paper)
+        return READERS[request.param](path)
+
+    return write_and_read
 
 
-def test_ruler_is_100_mm_outside_the_sheet(out: Path) -> None:
-    write_sheet(square(120, 50), out)
-    printed = Printed(out)
-    ((_, top, _, height, _),) = printed.boxes
-    below = [line for line in printed.lines if line[1] > top + height and not line[4]]
-    (base,) = [line for line in below if line[1] == pytest.approx(line[3])]
-    ticks = sorted(line[0] for line in below if line[0] == pytest.approx(line[2]))
-    assert base[2] - base[0] == pytest.approx(100, abs=2e-3)
-    assert [t - base[0] for t in ticks] == pytest.approx(range(0, 101, 10), abs=2e-3)
-    assert "must measure 100.0 mm" in printed.text
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda s: f"{s.name}-{s.diameter_mm:g}")
+def test_every_circle_is_true_to_scale(reader, shape: MarkerShape) -> None:
+    _, discs, boxes, _, _ = reader(shape)
+    ink, ground = (1.0, 0.0) if shape.white_on_black else (0.0, 1.0)
+    sheet = boxes[0]
+    assert sheet[4] == ground
+    marker = discs[: len(shape.circles_mm)]
+    for _, _, diameter_mm, grey in marker:
+        assert diameter_mm == pytest.approx(shape.diameter_mm, abs=1e-3)
+        assert grey == ink
+    for (a, seen_a), (b, seen_b) in itertools.combinations(
+        zip(shape.circles_mm, marker, strict=True), 2
+    ):
+        assert seen_b[0] - seen_a[0] == pytest.approx(b[0] - a[0], abs=1e-3)
+        assert seen_b[1] - seen_a[1] == pytest.approx(a[1] - b[1], abs=1e-3)
 
 
-def test_page_says_what_to_do(out: Path) -> None:
-    write_sheet(square(120, 50), out)
-    text = Printed(out).text
-    assert "print at 100 %, do not fit to page" in text
-    assert "circles 50 mm in diameter, white on black, nearest centres 120 mm apart" in text
-    assert "cut along the dashed line" in text
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda s: f"{s.name}-{s.diameter_mm:g}")
+def test_the_background_reaches_as_far_as_regions_rely_on(reader, shape: MarkerShape) -> None:
+    size, discs, boxes, strokes, _ = reader(shape)
+    left, top, width, height, _ = boxes[0]
+    marker = discs[: len(shape.circles_mm)]
+    beyond_mm = (0.5 + SHEET_MARGIN) * shape.diameter_mm
+    assert left == pytest.approx(min(d[0] for d in marker) - beyond_mm, abs=1e-3)
+    assert left + width == pytest.approx(max(d[0] for d in marker) + beyond_mm, abs=1e-3)
+    assert top == pytest.approx(min(d[1] for d in marker) - beyond_mm, abs=1e-3)
+    assert top + height == pytest.approx(max(d[1] for d in marker) + beyond_mm, abs=1e-3)
+    assert left >= 5 - 1e-3
+    assert left + width <= size[0] - 5 + 1e-3
+    cut = {tuple(round(v, 2) for v in s) for s in strokes}
+    assert tuple(round(v, 2) for v in (left, top, left + width, top)) in cut
 
 
-def test_cut_line_goes_round_sheet_and_arrow(out: Path) -> None:
-    write_sheet(square(120, 50), out)
-    printed = Printed(out)
-    ((left, top, width, height, _),) = printed.boxes
-    dashed = [line for line in printed.lines if line[4]]
-    xs = sorted({round(v, 2) for line in dashed for v in (line[0], line[2])})
-    ys = sorted({round(v, 2) for line in dashed for v in (line[1], line[3])})
-    assert len(dashed) == 4
-    assert xs[0] < left < left + width < xs[-1]
-    ((tip, right, other),) = printed.arrows
-    assert tip[1] < right[1] == pytest.approx(other[1])
-    assert ys[0] < tip[1] < other[1] < top < top + height < ys[-1]
-    assert "up" in printed.text.split()
+def test_the_ruler_is_100_mm_with_a_tick_each(reader) -> None:
+    size, _, boxes, strokes, text = reader(A4)
+    sheet_bottom = boxes[0][1] + boxes[0][3]
+    below = [s for s in strokes if min(s[1], s[3]) > sheet_bottom + 1]
+    [base] = [s for s in below if s[1] == s[3]]
+    assert base[2] - base[0] == pytest.approx(100.0, abs=1e-3)
+    ticks = sorted(s[0] for s in below if s[0] == s[2])
+    assert ticks == pytest.approx([base[0] + mm for mm in range(101)], abs=1e-3)
+    assert max(s[3] for s in below) < size[1] - 5
+    assert "it must be 100.0 mm long" in text
+
+
+def test_the_page_says_what_it_is_and_how_to_print_it(reader) -> None:
+    *_, text = reader(A4)
+    assert "4 circles white on black, diameter 45 mm, spacing 108 mm, scale 1:1" in text
+    assert "Print at 100 %, not fitted to the page." in text
+    assert "Cut along the dashed line; mount flat, arrow up." in text
+    assert text.split().count("up") == 2
+    assert [word for word in ("1", "2", "3", "4") if word in text.split()] == ["1", "2", "3", "4"]
 
 
 @pytest.mark.parametrize(
     ("shape", "paper", "size"),
     [
-        (square(20, 10), "A4 portrait", (210, 297)),
-        (square(120, 27), "A4 portrait", (210, 297)),
-        (square(120, 27.1), "A3 portrait", (297, 420)),
-        (square(120, 50), "A3 portrait", (297, 420)),
-        (
-            MarkerShape("m1", ((0, 0), (70, 0), (140, 0), (210, 0)), 20),
-            "A4 landscape",
-            (297, 210),
-        ),
-        (
-            MarkerShape("m1", ((0, 0), (100, 0), (200, 0), (300, 0)), 40),
-            "A3 landscape",
-            (420, 297),
-        ),
-        (square(200.5, 50), "a page larger than A3", (337, 374)),
+        (A4, "auto", (210, 297)),
+        (DEFAULT, "auto", (297, 420)),
+        (square(112, 46), "auto", (215.9, 279.4)),
+        (A4, "A3", (297, 420)),
+        (A4, "Letter", (215.9, 279.4)),
+        (MarkerShape("wide", ((0, 0), (60, 5), (120, -5), (190, 0)), 25), "auto", (297, 210)),
+        (square(1000, 300), "auto", (1610, 1655)),
     ],
 )
-def test_smallest_paper_that_holds_all(
-    out: Path, shape: MarkerShape, paper: str, size: tuple[float, float]
+def test_the_paper_is_the_smallest_that_holds_the_sheet(
+    reader, shape: MarkerShape, paper: Paper, size: tuple[float, float]
 ) -> None:
-    sentence = write_sheet(shape, out)
-    printed = Printed(out)
-    assert printed.size == pytest.approx(size, abs=2e-3)
-    assert sentence == (
-        f"Wrote {out} for {paper} ({size[0]} x {size[1]} mm): print at 100 %, then measure the "
-        "ruler, which must be 100.0 mm long."
+    assert reader(shape, paper)[0] == pytest.approx(size, abs=1e-3)
+
+
+def test_both_formats_and_every_time_the_same() -> None:
+    page = sheet_page(A4)
+    assert pdf_bytes(page) == pdf_bytes(page)
+    assert svg_bytes(page) == svg_bytes(page)
+
+
+def test_viewers_are_asked_not_to_scale(tmp_path: Path) -> None:
+    path = tmp_path / "marker.pdf"
+    write_sheet(A4, path)
+    assert pypdf.PdfReader(path).root_object["/ViewerPreferences"]["/PrintScaling"] == "/None"
+
+
+def test_the_answer_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "marker.pdf"
+    assert write_sheet(A4, path) == (
+        f"{path}: 4 circles white on black, diameter 45 mm, spacing 108 mm, on A4 (210 x 297 mm). "
+        "Print it at 100 %, not fitted to the page, and measure the ruler: it must be 100.0 mm "
+        "long."
     )
-    xs = [x for line in printed.lines for x in (line[0], line[2])]
-    ys = [y for line in printed.lines for y in (line[1], line[3])]
-    assert min(*xs, *ys) >= 10 - 2e-3
-    assert max(xs) <= size[0] - 10 + 2e-3
-    assert max(ys) <= size[1] - 10 + 2e-3
+    assert write_sheet(DEFAULT, path).endswith(" At 90 % of these dimensions it would fit on A4.")
+    assert sheet_page(square(0.9 * 120, 0.9 * 50)).name == "A4"
 
 
-def test_same_shape_gives_same_bytes(out: Path) -> None:
-    write_sheet(square(120, 50), out)
-    first = out.read_bytes()
-    write_sheet(square(120, 50), out)
-    assert out.read_bytes() == first
-
-
-def test_pdf_asks_the_viewer_not_to_scale(tmp_path: Path) -> None:
-    write_sheet(square(120, 50), tmp_path / "marker.pdf")
-    assert Printed(tmp_path / "marker.pdf").print_scaling == "/None"
-
-
-@pytest.mark.parametrize("spacing_mm", [40, 50])
-def test_circles_that_overlap_or_touch(out: Path, spacing_mm: float) -> None:
-    with pytest.raises(SheetError) as caught:
-        write_sheet(square(spacing_mm, 50), out)
-    assert str(caught.value) == (
-        f"circles of 50 mm diameter with centres only {spacing_mm} mm apart overlap or touch; "
-        "make the spacing larger or the diameter smaller"
-    )
-    assert not out.exists()
-
-
-@pytest.mark.parametrize("name", ["marker.png", "marker"])
-def test_other_suffix(tmp_path: Path, name: str) -> None:
-    out = tmp_path / name
-    with pytest.raises(SheetError, match=r"ends in neither \.pdf nor \.svg; name the file with"):
-        write_sheet(square(120, 50), out)
-    assert not out.exists()
-
-
-def test_suffix_in_capitals(tmp_path: Path) -> None:
-    write_sheet(square(120, 50), tmp_path / "MARKER.PDF")
-    assert (tmp_path / "MARKER.PDF").read_bytes().startswith(b"%PDF-")
-
-
-def test_folder_that_is_not_there(out: Path) -> None:
-    lost = out.parent / "lost" / out.name
-    with pytest.raises(SheetError) as caught:
-        write_sheet(square(120, 50), lost)
-    assert str(caught.value) == (
-        f"{lost} cannot be written (No such file or directory); "
-        "name a file in a folder you can write to"
-    )
-
-
-def test_page_too_large_for_pdf_goes_to_svg(tmp_path: Path) -> None:
-    shape = square(5000, 50)
-    with pytest.raises(SheetError, match=r"5136 x 5173 mm, and a PDF page is at most 5080 mm"):
-        write_sheet(shape, tmp_path / "marker.pdf")
-    write_sheet(shape, tmp_path / "marker.svg")
-    assert Printed(tmp_path / "marker.svg").size == (5136, 5173)
-
-
-def test_verb_marker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "marker.svg"
-    spec = ["--spacing-mm", "80", "--diameter-mm", "30", "--black-on-white", "--out", str(out)]
-    assert cli.run(["marker", *spec]) == cli.EXIT_STOPPED
-    assert capsys.readouterr().out.startswith(f"Wrote {out} for A4 portrait")
-    discs = Printed(out).discs
-    assert {d[2] for d in discs} == {30.0}
-    assert {d[4] for d in discs} == {"black"}
-    nearest = min(math.dist(a[:2], b[:2]) for a, b in itertools.combinations(discs, 2))
-    assert nearest == pytest.approx(80)
-
-    assert cli.run(["marker", "--spacing-mm", "30", "--out", str(out)]) == cli.EXIT_FAILED
-    assert "overlap" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("shape", "name", "paper", "sentence"),
+    [
+        (square(50, 50), "m.pdf", "auto", "circles 1 and 2 overlap: their centres lie 50 mm apart"),
+        (square(40, 50), "m.svg", "auto", "give a larger --spacing-mm or a smaller --diameter-mm"),
+        (square(120, 0), "m.pdf", "auto", "a diameter of 0 mm cannot be printed"),
+        (square(120, math.nan), "m.pdf", "auto", "a diameter of nan mm cannot be printed"),
+        (square(4000, 1000), "m.pdf", "auto", "the sheet is 6000 x 6000 mm, more than a page can"),
+        (DEFAULT, "m.pdf", "A4", "the sheet is 220 x 220 mm, too large for A4"),
+        (DEFAULT, "m.png", "auto", "the sheet can be .pdf or .svg"),
+        (DEFAULT, "none/m.pdf", "auto", "none/m.pdf: No such file or directory; name another with"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence(
+    tmp_path: Path, shape: MarkerShape, name: str, paper: Paper, sentence: str
+) -> None:
+    with pytest.raises(SheetError) as fault:
+        write_sheet(shape, tmp_path / name, paper)
+    assert sentence in str(fault.value)
+    assert "\n" not in str(fault.value)
+    assert not (tmp_path / name).exists()
