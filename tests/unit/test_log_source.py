@@ -25,7 +25,7 @@ from vdms_rt.model import (
     SourceError,
     StampEvent,
 )
-from vdms_rt.setup import MarkerSetUp, SetUp, SetUpError, set_up_json
+from vdms_rt.setup import FieldSetUp, MarkerSetUp, SetUp, SetUpError, set_up_json
 from vdms_rt.wire import topics
 from vdms_rt.wire import vdms_pb2 as pb
 from vdms_rt.wire.convert import pixels_bytes
@@ -245,11 +245,13 @@ def test_the_recorded_set_up_is_the_one_that_the_pixels_name(tmp_path):
     marker = MarkerSetUp(
         shape=shape,
         regions=REGIONS[0],
-        reference_px=((1.25, 2.5),),
-        area_px=(300.0,),
-        contrast=(170.0,),
         noise_px=0.01,
         homography=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        fields=(
+            FieldSetUp(
+                kind=Scan.TOP, reference_px=((1.25, 2.5),), area_px=(300.0,), contrast=(170.0,)
+            ),
+        ),
     )
     set_up = SetUp(
         revision=1,
