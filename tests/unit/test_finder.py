@@ -420,3 +420,37 @@ def room_alone(seed):
 def test_the_room_behind_the_virtual_table_is_no_marker(first):
     for seed in range(first, first + 12):
         assert find_markers(room_alone(seed), EVERY_SHAPE, Scan(seed % 3)) == []
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (3, 5), (16, 16), (481, 719)])
+@pytest.mark.parametrize("scan", list(Scan))
+def test_a_picture_of_any_size_can_be_searched(size, scan):
+    image = np.random.default_rng(0).integers(0, 256, size, dtype=np.uint8)
+    assert find_markers(image, EVERY_SHAPE, scan) == []
+    assert find_markers(image, [], scan) == []
+
+
+def test_a_square_within_a_larger_marker_is_not_taken_for_the_sheet():
+    view = View(shape=GRID, px_per_mm=1.2)
+    found = find_markers(picture([view], Lab()), [SQUARE, GRID], Scan.PROGRESSIVE)
+    assert_found(found, view)
+
+
+def test_discs_in_half_shade_are_no_marker():
+    image = discs_on_black(CORNERS, (RADIUS, RADIUS))
+    for x, y in CORNERS.astype(int):
+        part = image[y - 40 : y + 40, x - 8 : x + 40]
+        part[part > 150] -= 60
+    assert find_markers(image, [SQUARE], Scan.PROGRESSIVE) == []
+
+
+@pytest.mark.parametrize("grey", [130, 160, 190])
+def test_a_bright_part_around_a_disc_does_not_hide_it(grey):
+    view = View(px_per_mm=0.4, angle_deg=-45.0, roll_deg=-4.9, aspect=0.986, at_px=(604.8, 281.3))
+    image = picture([view], Lab(clutter=None))
+    x, y = np.rint(view.centres()[3]).astype(int)
+    wall = np.zeros(image.shape, np.uint8)
+    wall[y - 90 : y + 91, x - 108 : x + 84] = 1
+    cv2.fillPoly(wall, [np.rint(view.sheet()).astype(np.int32)], 0)
+    image[wall > 0] = grey
+    assert_found(find_markers(image, [SQUARE], Scan.PROGRESSIVE), view)

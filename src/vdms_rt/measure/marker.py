@@ -246,7 +246,7 @@ def _plausible(h: Matrix, layout: Layout, extent: float) -> bool:
         return False
     square = jacobian_px_per_mm(h, middle[None])[0] / [[PIXEL_ASPECT], [-1.0]]
     long, short = np.linalg.svd(square, compute_uv=False)
-    if np.linalg.det(square) <= 0 or short < MIN_FORESHORTENING * long:
+    if short < MIN_FORESHORTENING * long:
         return False
     return abs(roll_deg(h, PIXEL_ASPECT, (middle[0], middle[1]))) < MAX_ROLL_DEG
 
