@@ -165,6 +165,7 @@ class Daemon:
                 health = self._health()
                 self._outlet.health(health)
             self._keep_set_up()
+            self._outlet.tell()
             self._console.status(status_line(health, self._processor.counters.newest))
             since_s = self._started_s if first_frame_s is None else first_frame_s
             if seconds and now_s - since_s >= seconds:
@@ -195,6 +196,7 @@ class Daemon:
 
     def _account(self) -> int:
         """Tell what there is to tell at the end and return the exit status."""
+        self._outlet.tell()
         for fault in self._faults:
             if isinstance(fault, VdmsError):
                 raise fault

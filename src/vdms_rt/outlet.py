@@ -6,6 +6,7 @@ import logging
 import math
 import threading
 import time
+from collections import Counter, deque
 from dataclasses import replace
 
 from vdms_rt import codec
@@ -27,6 +28,9 @@ LEVELS = {
 }
 
 
+TOLD_OF_A_CODE = 3
+
+
 class Outlet:
     """Used by all threads. Sinks are attached before the threads start."""
 
@@ -43,6 +47,7 @@ class Outlet:
         self._patches = patches
         self._utc_offset_ns = time.time_ns() - time.monotonic_ns()
         self._newest_ns = 0
+        self._untold: deque[Event] = deque(maxlen=1000)
         self._lock = threading.Lock()
         self._age_sum_ms = 0.0
         self._age_count = 0
@@ -79,16 +84,29 @@ class Outlet:
         self._say(topics.TRUTH, truth.marker, at_ns, convert.truth_bytes(truth))
 
     def event(self, event: Event) -> None:
-        """Say that something happened, to the network, the log and the console."""
+        """Say that something happened: to network and log now, to the console by `tell`."""
         if not event.utc_ns and not event.t_ns:
             event = replace(event, utc_ns=self.now_ns())
-        log.log(LEVELS[event.severity], event.text)
+        self._untold.append(event)
         self._say(
             topics.EVENT,
             "",
             event.utc_ns or event.t_ns,
             convert.event_bytes(event, self.session),
         )
+
+    def tell(self) -> None:
+        """Write what happened since the last call to the console, which may make its writer wait;
+        so no stage does it, but the supervisor. Of many events of one code, the first few."""
+        counts: Counter[str] = Counter()
+        while self._untold:
+            event = self._untold.popleft()
+            counts[event.code] += 1
+            if counts[event.code] <= TOLD_OF_A_CODE:
+                log.log(LEVELS[event.severity], event.text)
+        for code, count in counts.items():
+            if count > TOLD_OF_A_CODE:
+                log.warning("%d more events: %s", count - TOLD_OF_A_CODE, code)
 
     def set_up(self, set_up: SetUp, image: Luma) -> None:
         """Say the set-up now in force; `image` is a picture taken with it."""

@@ -243,8 +243,10 @@ def raster(shape: Shape, edge_px: tuple[float, float], row_step: int) -> Raster:
     """
     fine = 16
     width_x, width_y = edge_px
-    yy = max(shape[2] - width_y * width_y / 2, 1e-3)
-    xx = max(shape[0] - width_x * width_x / 2, 1e-3)
+    # The weighed edge has half the variance, and a round edge bends its middle inwards.
+    bend = (width_x * width_x + width_y * width_y) / 16
+    yy = max(shape[2] - width_y * width_y / 2 + bend, 1e-3)
+    xx = max(shape[0] - width_x * width_x / 2 + bend, 1e-3)
     half_height, lean = 2 * math.sqrt(yy), shape[1] / yy
     half_chord = 2 * math.sqrt(max(xx - shape[1] ** 2 / yy, 1e-3))
     period = fine * row_step

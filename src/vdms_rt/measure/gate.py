@@ -21,6 +21,7 @@ Shape = tuple[float, float, float]
 """Second central moments xx, xy, yy of a circle's picture, in whole-frame px^2. The picture is an
 ellipse: all points q with q' C^-1 q = 4 for the matrix C of these."""
 
+FEW_PIXELS = 100
 FLAT_PIXELS = 600
 """Enough of a disc's flat pixels for its levels; of larger discs not every row is used."""
 _MAX_GATES = 64
@@ -69,18 +70,21 @@ class Gate:
 
         self.x_px, self.y_px = x, y
         """Pixels of the whole frame from the middle of a box, (width,) and (height, 1)."""
-        self._flats(distance, x, y, margin_px)
+        self._flats(shapes, distance, x, y, margin_px)
         self._edges(shapes, fields, margin_px, row_step)
 
     def _flats(
         self,
+        shapes: tuple[Shape, ...],
         distance: NDArray[np.float64],
         x: NDArray[np.float64],
         y: NDArray[np.float64],
         margin_px: int,
     ) -> None:
-        deepest = -float(distance.min(axis=(1, 2)).max())
-        disc = np.all(distance < -min(margin_px, 0.6 * deepest), axis=0)
+        smallest = min(
+            2 * math.sqrt(np.linalg.eigvalsh([[xx, xy], [xy, yy]])[0]) for xx, xy, yy in shapes
+        )
+        disc = np.all(distance < -min(margin_px, 0.5 * smallest), axis=0)
         ground = np.all(distance > margin_px + 0.5, axis=0)
         if not ground.any():
             nearest = distance.min(axis=0)
@@ -103,7 +107,8 @@ class Gate:
         self.levels = np.empty((self.count, 4), np.float32)
         self.disc_pixels = np.flatnonzero(disc.ravel())
         self.disc_plane = plane[:, 1:].T.astype(np.float32)
-        self.disc_freedom = max(1, len(plane) - 3)
+        self.disc_freedom = len(plane) - 3
+        self.ground_pixels = np.flatnonzero(ground.ravel())
         noise = np.linalg.norm(self.flat_weights, axis=0).tolist()
         self.slope_noise_x, self.slope_noise_y = noise[2], noise[3]
         """Standard deviation of the slopes for noise of 1."""
@@ -223,5 +228,6 @@ def distance_px(
     det = xx * yy - xy * xy
     ax, ay = (yy * x - xy * y) / det, (xx * y - xy * x) / det
     radius = np.maximum(np.sqrt(ax * x + ay * y) / 2, 1e-6)
-    slope = np.maximum(np.hypot(ax, ay) / (4 * radius), 1e-9)
+    # At the centre itself any direction would do; this one leads along the longest half.
+    slope = np.maximum(np.hypot(ax, ay) / (4 * radius), 0.5 / math.sqrt(xx + yy))
     return (radius - 1) / slope, ax / (4 * radius * slope), ay / (4 * radius * slope)

@@ -11,13 +11,15 @@ import numpy as np
 
 from vdms_rt.measure.edge import spread_table, weight
 from vdms_rt.measure.expect import Expected
-from vdms_rt.measure.gate import Gate, Shape, Workspace, fill_boxes
+from vdms_rt.measure.gate import FEW_PIXELS, Gate, Shape, Workspace, fill_boxes
 from vdms_rt.model import Luma
 
 EFFICIENCY = 1.05
 """Standard deviation of this centroid over the Cramer-Rao bound, for the whole bench."""
 EDGE_REACH_PX = 2.2
 """Of the blurred edge beside its middle, with what the rounding to whole pixels adds."""
+RASTER_SHARE = 0.05
+"""How far the raster's pull is known: its model takes the edge as a Gaussian's."""
 MAX_PASSES = 4
 REFRESH_PICTURES = 32
 """Every so many pictures one circle's slow figures are measured anew."""
@@ -117,6 +119,7 @@ def _read(
     half_width, half_height = gate.half_width, gate.half_height
     reach_x = expected.margin_px - EDGE_REACH_PX
     reach_y = reach_x / row_step
+    raster_part = RASTER_SHARE * RASTER_SHARE / 2
     variance_part = EFFICIENCY * EFFICIENCY * variance_grey2
     sum_x = sum_y = 0.0
     escaped = relit = False
@@ -168,7 +171,7 @@ def _read(
                     disc,
                     ground,
                     (slope_x / disc, slope_y / disc),
-                    (sxx * part, sxy * part, syy * part),
+                    (sxx * part, sxy * part, syy * part + raster_part * wave_y * wave_y),
                 ),
             )
         )
@@ -281,7 +284,11 @@ def _slow_figures(gate: Gate, k: int) -> tuple[float, float, float]:
     flat = gate.flat_of_each[k].take(gate.disc_pixels)
     flat -= np.float32(disc)
     flat -= np.array([slope_x, slope_y], np.float32) @ gate.disc_plane
-    variance = float(np.dot(flat, flat)) / gate.disc_freedom
+    squares, freedom = float(np.dot(flat, flat)), gate.disc_freedom
+    if freedom < FEW_PIXELS:
+        flat = gate.flat_of_each[k].take(gate.ground_pixels) - np.float32(ground)
+        squares, freedom = squares + float(np.dot(flat, flat)), freedom + len(flat) - 1
+    variance = squares / freedom
     spread = spread_table(ground, disc).take(gate.raw[k].ravel())
     noise = variance / ((disc - ground) ** 2 + 1e-6)
     x, y = (spread @ gate.edge_weights[k] + noise * gate.edge_offset[k]).tolist()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from vdms_rt.measure.expect import Appearance, Expected, raster
-from vdms_rt.measure.gate import Shape
+from vdms_rt.measure.expect import NO_RASTER, Appearance, Expected, raster
 from vdms_rt.measure.smooth import CircleReading, Slow
 from vdms_rt.model import CircleFlag
 
@@ -63,59 +62,77 @@ class Limits:
     """Contrast at rest, negative for a dark disc."""
 
 
-def learn(
-    stills: Sequence[tuple[Sequence[CircleReading], Slow]], row_offset: int, row_step: int
-) -> tuple[Appearance, Limits]:
-    """Return how the circles look at rest and how far that varies, from the readings of a resting
-    marker, picture by picture, all of one kind (whole, or one field).
+Still = tuple[Sequence[CircleReading], Slow]
+"""What `smooth.study` returned for one picture of the resting marker."""
 
-    Each still is what `smooth.study` returned for it, with no raster expected (as by `first_look`):
-    that is worked out here and taken off the means. Raises ValueError without any.
+
+def learn(
+    stills: Mapping[int, Sequence[Still]], row_step: int
+) -> dict[int, tuple[Appearance, Limits]]:
+    """Return how the circles look at rest and how far that varies, from pictures of a resting
+    marker: for each kind of picture, named by its row_offset, and with as many stills.
+
+    Whole pictures have row_step 1 and the one offset 0; fields have row_step 2, and offsets 0 and 1
+    if both are seen. The sizes and edges are then the mean of both, in which the raster's first
+    alias cancels; each field keeps its own places. The stills must have been studied with no raster
+    expected (as by `first_look`): it is worked out here and taken off. Raises ValueError without
+    any stills.
     """
-    if not stills:
-        raise ValueError("no stills: at least one reading of the resting marker is needed")
-    table = np.array([[_figures(r) for r in readings] for readings, _ in stills])
-    mean = table.mean(axis=0)
-    scatter = np.zeros_like(mean)
-    if len(table) > 1:
-        # Of successive differences: a slow drift of the light is not noise.
-        scatter = np.sqrt(np.mean(np.diff(table, axis=0) ** 2, axis=0) / 2)
-    columns: list[list[float]] = mean.T.tolist()
-    x, y, area = columns[:3]
-    shapes: list[Shape] = []
-    widths = np.array([slow.edge_px for _, slow in stills]).mean(axis=0)
-    edges = tuple((ex, ey) for ex, ey in np.maximum(widths, LEAST_EDGE_PX).tolist())
-    for k, edge in enumerate(edges):
-        xx, xy, yy = columns[3][k], columns[4][k], columns[5][k]
-        shape = (xx, xy, yy)
-        seen_y = y[k]
-        for _ in range(3):
-            phase = 2 * math.pi * (y[k] - row_offset) / row_step
-            wave = raster(shape, edge, row_step)
-            y[k] = seen_y - wave.y_px * math.sin(phase)
-            shape = (xx, xy, yy - wave.yy_px2 * math.cos(phase))
-        x[k] -= xy / yy * (seen_y - y[k])
-        area[k] /= 1 + wave.area * math.cos(phase)
-        shapes.append(shape)
-    appearance = Appearance(
-        row_step=row_step,
-        x_px=tuple(x),
-        y_px=tuple(y),
-        area_px=tuple(area),
-        moments_px2=tuple(shapes),
-        disc_grey=tuple(columns[6]),
-        ground_grey=tuple(columns[7]),
-        light_per_px=tuple(zip(columns[8], columns[9], strict=True)),
-        variance_grey2=float(np.mean([slow.variance_grey2 for _, slow in stills])),
-        edge_px=edges,
-    )
-    limits = FLOOR + DEVIATIONS * scatter[:, 10:13]
-    return appearance, Limits(
-        area=tuple((FLOOR + DEVIATIONS * scatter[:, 2] / mean[:, 2]).tolist()),
-        fill=tuple(limits[:, 0].tolist()),
-        moment=tuple(limits[:, 1:].max(axis=1).tolist()),
-        contrast_grey=tuple((mean[:, 6] - mean[:, 7]).tolist()),
-    )
+    if not stills or not all(stills.values()):
+        raise ValueError("no stills: at least one of each field of the resting marker is needed")
+    means, scatters = {}, {}
+    for offset, kind in stills.items():
+        table = np.array([[_figures(r) for r in readings] for readings, _ in kind])
+        means[offset] = table.mean(axis=0)
+        scatters[offset] = np.zeros_like(means[offset])
+        if len(table) > 1:
+            # Of successive differences: a slow drift of the light is not noise.
+            scatters[offset] = np.sqrt(np.mean(np.diff(table, axis=0) ** 2, axis=0) / 2)
+    every = [slow for kind in stills.values() for _, slow in kind]
+    widths = np.maximum(np.array([slow.edge_px for slow in every]).mean(axis=0), LEAST_EDGE_PX)
+    variance = float(np.mean([slow.variance_grey2 for slow in every]))
+    both = np.array(list(means.values())).mean(axis=0)
+    learnt = {}
+    for offset, mean in means.items():
+        places, areas, shapes = [], [], []
+        for k, edge in enumerate(widths.tolist()):
+            x, seen_y = mean[k, :2].tolist()
+            area, xx, xy, yy = both[k, 2:6].tolist()
+            y, shape, wave = seen_y, (xx, xy, yy), NO_RASTER
+            for _ in range(3):
+                wave = raster(shape, (edge[0], edge[1]), row_step)
+                phase = 2 * math.pi * (y - offset) / row_step
+                y = seen_y - wave.y_px * math.sin(phase)
+                if len(means) < row_step:
+                    shape = (xx, xy, yy - wave.yy_px2 * math.cos(phase))
+            places.append((x - xy / yy * (seen_y - y), y))
+            areas.append(
+                area / (1 + wave.area * math.cos(phase)) if len(means) < row_step else area
+            )
+            shapes.append(shape)
+        scatter = scatters[offset]
+        limits = FLOOR + DEVIATIONS * scatter[:, 10:13]
+        learnt[offset] = (
+            Appearance(
+                row_step=row_step,
+                x_px=tuple(x for x, _ in places),
+                y_px=tuple(y for _, y in places),
+                area_px=tuple(areas),
+                moments_px2=tuple(shapes),
+                disc_grey=tuple(mean[:, 6].tolist()),
+                ground_grey=tuple(mean[:, 7].tolist()),
+                light_per_px=tuple((a, b) for a, b in mean[:, 8:10].tolist()),
+                variance_grey2=variance,
+                edge_px=tuple((a, b) for a, b in widths.tolist()),
+            ),
+            Limits(
+                area=tuple((FLOOR + DEVIATIONS * scatter[:, 2] / mean[:, 2]).tolist()),
+                fill=tuple(limits[:, 0].tolist()),
+                moment=tuple(limits[:, 1:].max(axis=1).tolist()),
+                contrast_grey=tuple((mean[:, 6] - mean[:, 7]).tolist()),
+            ),
+        )
+    return learnt
 
 
 def _figures(r: CircleReading) -> tuple[float, ...]:

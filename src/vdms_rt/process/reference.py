@@ -189,6 +189,10 @@ def _marker(
 ) -> MarkerSetUp:
     """Return marker number n, whose circles are `own`. Raises VdmsError if they do not make a
     homography."""
+    learnt = {}
+    if progress.plan.method == "smooth":
+        stills = {same[0].row_offset: [s.readings[n] for s in same] for same in by_kind.values()}
+        learnt = learn(stills, next(iter(by_kind.values()))[0].row_step)
     fields = []
     noises = []
     for kind, same in by_kind.items():
@@ -196,10 +200,8 @@ def _marker(
         noises.append(noise_px(centres))
         reference = [(float(x), float(y)) for x, y in centres.mean(axis=0)]
         appearance = limits = None
-        if progress.plan.method == "smooth":
-            appearance, limits = learn(
-                [s.readings[n] for s in same], same[0].row_offset, same[0].row_step
-            )
+        if learnt:
+            appearance, limits = learnt[same[0].row_offset]
             reference = list(zip(appearance.x_px, appearance.y_px, strict=True))
         circles = [s.circles[own] for s in same]
         fields.append(
