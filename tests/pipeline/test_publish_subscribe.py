@@ -333,6 +333,7 @@ def end(process: subprocess.Popen[str], number: signal.Signals = signal.SIGKILL)
     process.communicate(timeout=DEADLINE_S)
 
 
+@pytest.mark.slow
 def test_a_station_that_is_killed_and_started_again_goes_on_as_a_new_session(
     endpoint: str,
 ) -> None:
@@ -355,6 +356,7 @@ def test_a_station_that_is_killed_and_started_again_goes_on_as_a_new_session(
     assert [type(n) for n in notices[:5]] == [Arrived, Left, Arrived, Left, Arrived]
 
 
+@pytest.mark.slow
 def test_a_stopped_reader_holds_up_nobody(endpoint: str) -> None:
     reader = (
         "import sys\nfrom vdms_rt.subscribe import subscribe\n"
@@ -583,6 +585,16 @@ def test_close_ends_a_loop_in_another_thread(endpoint: str) -> None:
     assert samples.get() is None
 
 
+def test_a_subscription_that_is_let_go_ends(endpoint: str) -> None:
+    with publisher(endpoint) as station:
+        samples = subscribe(connect=endpoint)
+        await_links(station, 1)
+        [thread] = [t for t in threading.enumerate() if t.name == f"subscribe {endpoint}"]
+        del samples
+        thread.join(DEADLINE_S)
+        assert not thread.is_alive()
+
+
 def test_callbacks(endpoint: str) -> None:
     got: list[int] = []
     told: list[Notice] = []
@@ -646,6 +658,7 @@ done.wait()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("program", "end", "status"),
     [
@@ -672,6 +685,7 @@ def test_a_short_program_ends_by_itself(endpoint: str, program: str, end: str, s
     assert ("mine" in run.stderr) == (status == 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("up", [True, False])
 def test_ctrl_c_ends_the_loop_whether_or_not_there_is_a_station(endpoint: str, up: bool) -> None:
     program = (

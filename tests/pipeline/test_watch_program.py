@@ -94,6 +94,7 @@ def test_in_a_pipe_it_is_plain_lines_and_a_summary(number: signal.Signals) -> No
     assert "\x1b" not in out
 
 
+@pytest.mark.slow
 def test_every_sample_is_in_the_csv_over_restarts_of_station_and_watch(tmp_path: Path) -> None:
     path = tmp_path / "samples.csv"
     endpoint = free_endpoint()
