@@ -6,6 +6,7 @@ thread, the only one that touches the disk.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 import threading
@@ -154,6 +155,7 @@ class Recorder:
         The body of the record thread. With the disk in trouble at the end it tries once more,
         counts what it could not write and leaves the file for the next start to repair.
         """
+        failed_at_end = 0
         self._backlog.claim()
         try:
             while self._wait():
@@ -161,10 +163,9 @@ class Recorder:
                     self._work()
                 except OSError as error:
                     self._pause(error)
-                    if self._ending:
+                    failed_at_end += self._ending
+                    if failed_at_end > 1:
                         break
-                else:
-                    self._resume()
                 self._tell_lost()
         finally:
             self._backlog.end()
@@ -200,7 +201,7 @@ class Recorder:
         for item in self._backlog.take():
             self._write(log, item)
         log.drain()
-        if time.monotonic() >= self._sync_due_s:
+        if time.monotonic() >= self._sync_due_s or self._trouble:
             self._sync(log)
         if self._ending and not len(self._backlog) and not self._backlog.has_lost:
             self._close(log, self._end_reason or "")
@@ -219,6 +220,7 @@ class Recorder:
     def _sync(self, log: LogWriter) -> None:
         self._timed(log.sync)
         self._sync_due_s = time.monotonic() + self._config.sync_s
+        self._resume(log)
 
     def _timed(self, to_disk: Callable[[], None]) -> None:
         started_s = time.monotonic()
@@ -228,11 +230,11 @@ class Recorder:
             took_ms = (time.monotonic() - started_s) * 1e3
             with self._lock:
                 self._fsync_ms = max(self._fsync_ms, took_ms)
-        free_bytes = _free_bytes(self._directory)
         with self._lock:
             self._recorded += len(self._unsynced)
-            self._disk_free_bytes = free_bytes
-        self._unsynced.clear()
+            self._unsynced.clear()
+            with contextlib.suppress(OSError):
+                self._disk_free_bytes = _free_bytes(self._directory)
 
     def _full(self, log: LogWriter) -> str:
         """Return why what comes next belongs into the next file, or nothing."""
@@ -317,13 +319,14 @@ class Recorder:
         if not told:
             self._tell(Severity.ERROR, "record-trouble", sentence)
 
-    def _resume(self) -> None:
+    def _resume(self, log: LogWriter) -> None:
         with self._lock:
             if not self._trouble:
                 return
             self._trouble = ""
         self._backlog.pause(False)
-        self._tell(Severity.INFO, "record-resumed", "recording again")
+        if not (log.sealed and self._ending):  # no file comes that could say it
+            self._tell(Severity.INFO, "record-resumed", "recording again")
 
     def _give_up(self) -> None:
         """Leave nothing open, and count what is in no file."""

@@ -369,6 +369,21 @@ def test_a_failed_flush_loses_no_message_and_doubles_none(tmp_path, monkeypatch)
     assert recorder.counters().not_recorded == 0
 
 
+def test_a_file_removed_under_it_costs_only_what_was_in_it(tmp_path):
+    recorder, told = recorder_for(tmp_path)
+    with running(recorder):
+        put_sample(recorder, 0)
+        wait_until_recorded(recorder, 2)  # the sample and the event
+        (part,) = files(tmp_path)
+        part.unlink()
+        for seq in range(1, 10):
+            put_sample(recorder, seq)
+    (path,) = files(tmp_path)
+    assert samples_in(path) == list(range(1, 10))
+    assert "no such file" in told.wait_for("record-trouble").text
+    assert recorder.counters().not_recorded == 0
+
+
 def test_trouble_that_lasts_to_the_end_is_counted_and_leaves_a_readable_file(tmp_path, monkeypatch):
     recorder, told = recorder_for(tmp_path)
     fsync, failing = os.fsync, threading.Event()

@@ -82,9 +82,9 @@ class _Pending:
 class LogWriter:
     """An MCAP being written by one thread.
 
-    `add` and `attach` never fail; `drain`, `sync` and `close` raise OSError. After one for want of
-    space nothing is lost: the same call again goes on where it stopped. After any other `broken`
-    is True, and `abandon` leaves what was synced.
+    `add` and `attach` never fail; `drain`, `sync` and `close` raise OSError. After a write that
+    found no space nothing is lost: the same call again goes on where it stopped. After anything
+    else `broken` is True, and `abandon` leaves what was synced.
     """
 
     def __init__(self, path: Path) -> None:
@@ -155,15 +155,16 @@ class LogWriter:
 
     def drain(self) -> None:
         """Hand the chunks that are complete to the operating system."""
-        with self._breaking():
+        with self._breaking(*NO_SPACE):
             self._sink.drain()
 
     def sync(self) -> None:
         """Put everything so far on the disk."""
         if not self._summarised:
             self._writer.flush()  # type: ignore[no-untyped-call]
+        self.drain()
+        # After a flush that failed the system holds what it had not written for written.
         with self._breaking():
-            self._sink.drain()
             os.fsync(self._fd)
             self._check_in_place()
         self._synced_length = self._sink.length
@@ -175,7 +176,7 @@ class LogWriter:
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._summarised = True
         self.sync()
-        with self._breaking():
+        with self._breaking(*NO_SPACE):
             if self.path.exists():
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path))
             self.part_path.rename(self.path)
@@ -198,11 +199,11 @@ class LogWriter:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self.part_path))
 
     @contextlib.contextmanager
-    def _breaking(self) -> Iterator[None]:
+    def _breaking(self, *harmless: int) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            self.broken = error.errno not in NO_SPACE
+            self.broken = error.errno not in harmless
             raise
 
 
