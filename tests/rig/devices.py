@@ -77,8 +77,8 @@ class Vivid:
 
 
 class Projector:
-    """Shows the frames on vivid's S-Video output, which its S-Video inputs then see: frame 0
-    until `move` is set, afterwards the others in a loop. A context manager.
+    """Shows the frames on vivid's S-Video output, which its S-Video inputs then see: the marker
+    at rest until `move` is set. A context manager.
 
     Output and input have clocks of their own, so a frame may be seen twice, or not at all.
     """
@@ -114,15 +114,11 @@ class Projector:
         assert not self._thread.is_alive()
 
     def _feed(self) -> None:
-        moved = 0
+        film = frames.Film()
         # The output takes a frame each 1001/30000 s, and the pipe makes us wait for it.
         with self._output.stdin as pipe, contextlib.suppress(BrokenPipeError):
             while not self._stop.is_set():
-                number = 0
-                if self.move.is_set():
-                    number = 1 + moved % (len(self._pictures) - 1)
-                    moved += 1
-                pipe.write(self._pictures[number])
+                pipe.write(self._pictures[film.next(held=not self.move.is_set())])
 
 
 class Grabber:
@@ -165,7 +161,7 @@ class Grabber:
         wait_for(lambda: not self.device(), "the grabber's node to go")
 
     def set(self, what: str, on: bool) -> None:
-        """`hold`: show frame 0 alone. `stall`: send nothing."""
+        """`hold`: show the marker at rest. `stall`: send nothing."""
         flag = self._control / what
         if on:
             flag.touch()

@@ -2,8 +2,9 @@
 
     python tests/rig/frames.py FRAMES.yuyv
 
-Frame 0 is the marker at rest. Frames 1 to PERIOD_FRAMES are one period of its motion, interlaced
-with the bottom field first: a loop. Each is WIDTH_PX x HEIGHT_PX in YUYV.
+The first REST_FRAMES are the marker at rest, each with noise of its own; the PERIOD_FRAMES after
+them are one period of its motion, interlaced with the bottom field first. Both are loops. Each
+frame is WIDTH_PX x HEIGHT_PX in YUYV.
 """
 
 import sys
@@ -13,7 +14,7 @@ import numpy as np
 
 WIDTH_PX, HEIGHT_PX = 720, 480
 FRAME_BYTES = WIDTH_PX * HEIGHT_PX * 2
-PERIOD_FRAMES = 30
+REST_FRAMES, PERIOD_FRAMES = 10, 30
 AMPLITUDE_MM = 10.0
 SPACING_MM, DIAMETER_MM = 120.0, 50.0
 SHEET_MM = SPACING_MM + 2 * DIAMETER_MM
@@ -56,14 +57,32 @@ def _draw_disc(grey: np.ndarray, centre_px: np.ndarray, radii_px: np.ndarray) ->
 
 def frame(number: int, rng: np.random.Generator) -> np.ndarray:
     """Return frame `number` in YUYV, (HEIGHT_PX, WIDTH_PX, 2)."""
-    grey = picture(0.0, 0.0)
-    if number > 0:
-        grey[1::2] = picture(*position_mm(number - 1))[1::2]
-        grey[0::2] = picture(*position_mm(number - 0.5))[0::2]
+    moved = number - REST_FRAMES
+    if moved < 0:
+        grey = picture(0.0, 0.0)
+    else:
+        grey = picture(*position_mm(moved))
+        grey[0::2] = picture(*position_mm(moved + 0.5))[0::2]
     grey += rng.normal(0, NOISE, grey.shape)
     yuyv = np.full((HEIGHT_PX, WIDTH_PX, 2), 128, np.uint8)
     yuyv[..., 0] = np.clip(np.round(grey), 16, 235)
     return yuyv
+
+
+class Film:
+    """The order in which the frames are shown: at rest as long as it is held, then moving, from
+    the motion's beginning on."""
+
+    def __init__(self) -> None:
+        self._rested = self._moved = 0
+
+    def next(self, held: bool) -> int:
+        """Return the number of the next frame."""
+        if held:
+            self._rested, self._moved = self._rested + 1, 0
+            return self._rested % REST_FRAMES
+        self._moved += 1
+        return REST_FRAMES + (self._moved - 1) % PERIOD_FRAMES
 
 
 def load(path: Path) -> np.ndarray:
@@ -75,7 +94,7 @@ def main(path: Path) -> None:
     rng = np.random.default_rng(1)
     # Under its own name only when it is whole.
     part = path.with_suffix(".part")
-    np.stack([frame(n, rng) for n in range(1 + PERIOD_FRAMES)]).tofile(part)
+    np.stack([frame(n, rng) for n in range(REST_FRAMES + PERIOD_FRAMES)]).tofile(part)
     part.replace(path)
 
 

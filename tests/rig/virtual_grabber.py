@@ -2,9 +2,8 @@
 
     PYTHONPATH=tests python -m rig.virtual_grabber usbtv|uvc FRAMES.yuyv --serial S --control DIR
 
-`usbip attach -r 127.0.0.1 -b 1-1` plugs it in, `usbip detach -p 0` pulls it out. It shows frame 0
-of the file while DIR/hold exists, afterwards the others in a loop, from their first one on; while
-DIR/stall exists it sends nothing.
+`usbip attach -r 127.0.0.1 -b 1-1` plugs it in, `usbip detach -p 0` pulls it out. It shows the
+marker at rest while DIR/hold exists, else moving; while DIR/stall exists it sends nothing.
 """
 
 import argparse
@@ -19,25 +18,17 @@ from rig.usbip import Device, Pace, Setup, Stall, isochronous_packets, serve
 FRAME_PERIOD_S = 1001 / 30000
 
 
-class Film:
-    """What the grabber's camera sees."""
+class Camera:
+    """What is at the grabber's input."""
 
-    def __init__(self, count: int, control: Path):
-        self._count = count
+    def __init__(self, control: Path):
+        self._film = frames.Film()
         self._hold, self._stall = control / "hold", control / "stall"
-        self._moved = 0
 
-    @property
-    def stalled(self) -> bool:
-        return self._stall.exists()
-
-    def next(self) -> int:
-        """Return the number of the next frame."""
-        if self._hold.exists():
-            self._moved = 0
-            return 0
-        self._moved += 1
-        return 1 + (self._moved - 1) % (self._count - 1)
+    def next(self) -> int | None:
+        """Return the number of the next frame, None when nothing is sent."""
+        number = self._film.next(self._hold.exists())
+        return None if self._stall.exists() else number
 
 
 class Usbtv(Device):
@@ -60,7 +51,7 @@ class Usbtv(Device):
     def __init__(self, serial: str, pictures: np.ndarray, control: Path):
         super().__init__(serial)
         self._fields = [self._chunks(p, odd) for p in pictures for odd in (0, 1)]
-        self._film = Film(len(pictures), control)
+        self._camera = Camera(control)
         self._pace = Pace(FRAME_PERIOD_S / 2)
         self._unsent: list[bytes] = []
         self._picture: int | None = None
@@ -107,8 +98,8 @@ class Usbtv(Device):
         if number % 2 == 0:
             # When the one before is still unsent the machine is too slow: this frame is lost whole.
             lost = len(self._unsent) > self._URBS
-            picture = self._film.next()
-            self._picture = None if lost or self._film.stalled else picture
+            picture = self._camera.next()
+            self._picture = None if lost else picture
         if self._picture is None:
             return
         chunks = self._fields[2 * self._picture + number % 2]
@@ -135,7 +126,7 @@ class Uvc(Device):
     def __init__(self, serial: str, pictures: np.ndarray, control: Path):
         super().__init__(serial)
         self._pictures = [picture.tobytes() for picture in pictures]
-        self._film = Film(len(pictures), control)
+        self._camera = Camera(control)
         self._pace = Pace(FRAME_PERIOD_S)
         self._frame_id = 0
         self._unsent = memoryview(b"")
@@ -215,8 +206,8 @@ class Uvc(Device):
         # What the machine was too slow for is lost.
         while (due_s := self._pace.due_s()) is not None and due_s <= now_s:
             self._pace.take()
-            picture = self._film.next()
-        if self._film.stalled:
+            picture = self._camera.next()
+        if picture is None:
             return
         self._frame_id ^= 1
         header = bytes((12, 0x82 | self._frame_id)) + bytes(10)

@@ -35,7 +35,7 @@ die() { say "$*"; exit 1; }
 # --- What it needs: packages, and the kernel ------------------------------------------------
 quietly() {
     local log=$cache/prepare.log
-    "$@" >"$log" 2>&1 || { tail -20 "$log" >&2; die "failed: $*"; }
+    "$@" >"$log" 2>&1 || { tail -n 20 "$log" >&2; die "failed: $*"; }
 }
 
 prepare() {
@@ -188,5 +188,6 @@ wait "$cat_pid" || true
 cat_pid=
 [ -s "$out/status" ] && exit "$(cat "$out/status")"
 say "the guest died"
-tail -20 "$out/console.log" "$out/qemu.log" >&2
+tail -n 20 "$out/console.log" >&2
+cat "$out/qemu.log" >&2
 exit 125
