@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vdms_rt.measure.homography import (
@@ -49,6 +49,7 @@ views = st.builds(
 markers = st.sampled_from([SQUARE_MM, SIX_MM, SQUARE_MM * [3, 1] + [500, -200]])
 
 
+@settings(deadline=None)
 @given(views, markers)
 def test_both_forms_find_the_map_that_made_the_picture(h, marker_mm):
     image_px = to_image_px(h, marker_mm)
@@ -64,6 +65,7 @@ def test_both_forms_find_the_map_that_made_the_picture(h, marker_mm):
         np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 
+@settings(deadline=None)
 @given(views, st.integers(0, 2**32 - 1))
 def test_both_forms_agree_on_four_disturbed_points(h, seed):
     noise = np.random.default_rng(seed).normal(0, 0.02, (4, 2))
@@ -90,6 +92,7 @@ def test_both_forms_agree_within_the_noise_on_six_points():
     assert (np.std(np.subtract(plain, scaled), axis=0) < 0.5 * deviation).all()
 
 
+@settings(deadline=None)
 @given(views)
 def test_inverse_mapping_returns_to_the_same_point(h):
     points_mm = np.array([(0.0, 0.0), (13.0, -40.0), (-55.0, 22.0)])

@@ -3,7 +3,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from vdms_rt.measure.regions import check_circles, check_regions, regions_around
@@ -84,15 +84,18 @@ def test_a_region_reaches_half_way_to_edge_and_neighbour():
     assert top_left.y_px + top_left.height_px - 1 == pytest.approx(180 + 60, abs=1)
 
 
+@settings(deadline=None)
 @given(
     shape=st.sampled_from([SQUARE, GRID]),
     angle=st.floats(-60, 60),
     roll=st.floats(-44, 44),
-    px_per_mm=st.floats(0.3, 1.6),
+    px_per_mm=st.floats(0.3, 2.0),
     aspect=st.floats(0.9, 1.2),
 )
 def test_regions_hold_their_circle_and_no_other(shape, angle, roll, px_per_mm, aspect):
-    found, _ = seen(shape, angle, roll, px_per_mm, aspect)
+    found, _ = seen(shape, angle, roll, px_per_mm, aspect, centre=(600.0, 450.0))
+    # Smaller circles are not found, and their regions would be too small to use.
+    assume(np.min(found.semi_axes_px) >= 4)
     # Boxes of turned ellipses that overlap cannot have rectangles of their own.
     boxes = [
         (np.subtract(c, s), np.add(c, s))
