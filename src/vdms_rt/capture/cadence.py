@@ -23,6 +23,8 @@ STAMPS = 34
 """So many are judged together, and in two halves, of which a source that jumps leaves one whole; a
 period off by 4 % is seen in them."""
 _ON_GRID = 0.55
+_ON_FOUND_GRID = 0.8
+"""Of many grids that are tried one or another fits by chance."""
 _AS_GOOD = 0.15
 _SEARCH = np.linspace(0.75, 1.25, 251)
 
@@ -69,17 +71,18 @@ class Cadence:
         self._steps.clear()
         self._seen = 0
 
-    def judge(self) -> tuple[Pace, Fraction] | None:
+    def judge(self, even: bool) -> tuple[Pace, Fraction] | None:
         """Return how the images come and the period they come at, in nanoseconds; None if that
-        looks otherwise than the last time."""
+        looks otherwise than the last time. `even` tells that they came at the period so far."""
         before = self._verdict
-        self._verdict, period_ns = self._verdict_now()
+        self._verdict, period_ns = self._verdict_now(even)
         return (self._verdict, period_ns) if self._verdict is before else None
 
-    def _verdict_now(self) -> tuple[Pace, Fraction]:
+    def _verdict_now(self, even: bool) -> tuple[Pace, Fraction]:
         stamps = np.array([stamp - self._stamps[-1] for stamp in self._stamps], dtype=np.float64)
-        halves = stamps[: STAMPS // 2], stamps[STAMPS // 2 :]
-        on_grid = max(_on_grid(half, float(self._period_ns)) for half in halves) >= _ON_GRID
+        half = STAMPS // 2
+        parts = (stamps[:half], stamps[half:]) if even else (stamps,)
+        on_grid = max(_on_grid(part, float(self._period_ns)) for part in parts) >= _ON_GRID
         if on_grid and not self._none_lost():
             return Pace.AS_SAID, self._period_ns
         median_ns = float(np.median(np.diff(stamps)))
@@ -87,7 +90,8 @@ class Cadence:
             return Pace.AS_SAID, self._period_ns
         if median_ns > 0:
             found_ns = self._found_ns(stamps, median_ns)
-            if _on_grid(stamps, float(found_ns)) >= _ON_GRID:
+            least = _ON_GRID if found_ns in self._known_ns else _ON_FOUND_GRID
+            if _on_grid(stamps, float(found_ns)) >= least:
                 return Pace.OTHER, found_ns
         return Pace.UNEVEN, self._period_ns
 

@@ -17,8 +17,8 @@ from vdms_rt.model import Event, Scan, Severity, SourceInfo, StampEvent, Tick
 UTC_SAMPLE_NS = 1_000_000_000
 STALL_NS = 2_000_000_000
 """After so long without an image the source's phase is not taken for granted."""
-DISTRUST = 8
-"""Images in a row after which the interval is believed and not a sequence that saw no loss."""
+DISTRUST = 3
+"""Images in a row after which their stamps are believed and not a sequence that saw no loss."""
 RATE_LIMIT = 400e-6
 """No quartz is off by more: the source runs at another rate than it says."""
 RATE_SURE = 900
@@ -94,7 +94,7 @@ class FrameClock:
         self._fields = 2 if info.scan in (Scan.TOP, Scan.BOTTOM) else 1
         self._exposure_ns, self._chain_delay_ns = exposure_ns, chain_delay_ns
         self._utc = (utc or UtcOffset()) if info.live else None
-        self._utc_due_ns: int | None = None
+        self._utc_at_ns: int | None = None
         self._slept = False
         self._set_period(info.frame_period_s * 10**9 / self._fields)
         self._slot: int | None = None
@@ -111,7 +111,7 @@ class FrameClock:
         self._calls, self._taken_back = 0, 0
         """How often images were called missed, and how often in error."""
         self._lately_missed: deque[int] = deque(maxlen=2 * STAMPS)
-        self._doubts = 0
+        self._doubts: list[int] = []
         self._phase = PhaseWatch()
         self._segment = 0
         self._missed = 0
@@ -124,9 +124,9 @@ class FrameClock:
         `scan` tells which field an image of alternating fields is. Costs some microseconds.
         """
         scan = self._info.scan if scan is None else scan
-        if self._utc_due_ns is None or stamp_ns >= self._utc_due_ns:
+        if self._utc_at_ns is None or abs(stamp_ns - self._utc_at_ns) >= UTC_SAMPLE_NS:
             self.sample_utc()
-            self._utc_due_ns = stamp_ns + UTC_SAMPLE_NS
+            self._utc_at_ns = stamp_ns
         if self._slot is None:
             self._slot = 0
             self._line.begin(0, stamp_ns)
@@ -146,6 +146,7 @@ class FrameClock:
                 self._phase.doubt_ns,
                 self._phase.step_sigma_ns,
                 self._held_up_ns(),
+                self._doubts[-1] * self._period if self._doubts else 0.0,
             )
         return Tick(
             index=(self._slot + self._shift) // self._fields,
@@ -196,12 +197,13 @@ class FrameClock:
         if broken:
             skipped = max(0, round(gap_ns / self._period_ns) - 1)
             self._miss(slot, skipped)
+            self._lately_missed.clear()
             slot += 1 + skipped
             self._restart([(slot, stamp_ns)])
             self._jump(broken)
             return slot
         if self._cadence.add(stamp_ns, step):
-            verdict = self._cadence.judge()
+            verdict = self._cadence.judge(not self._free)
             if verdict and verdict[0] is not (Pace.UNEVEN if self._free else Pace.AS_SAID):
                 self._change_pace(slot + 1, stamp_ns, *verdict)
                 return slot + 1
@@ -229,14 +231,16 @@ class FrameClock:
         line, period = self._line, self._period
         early_ns = line.early_limit_ns
         late_ns = stamp_ns - line.at(slot + 1)
-        if late_ns < -early_ns and self._just_missed:
+        if late_ns < -early_ns and self._just_missed and not self._counts_lost:
             slot = self._take_back(slot, stamp_ns)
             late_ns = stamp_ns - line.at(slot + 1)
         # Images that were held up come one upon the other, and nothing is missing between them.
         close = gap_ns < period - early_ns
         missed = 0 if close else max(0, math.floor((late_ns + early_ns) / period))
         if self._counts_lost and step > 0:
-            missed = self._believe(missed, step - 1)
+            missed, lost_count = self._believe(missed, step - 1)
+            if lost_count:
+                return self._leave_grid(slot + step, stamp_ns)
         missed = self._on_its_turn(slot, missed, scan)
         self._just_missed = missed
         self._calls += missed > 0
@@ -244,9 +248,9 @@ class FrameClock:
         slot += 1 + missed
         late_ns = stamp_ns - line.at(slot)
         moved_ns = 0.0
-        images = line.settled and self._phase.look(
-            slot, stamp_ns, late_ns, early_ns, line.late_limit_ns
-        )
+        images = self._phase.look(slot, stamp_ns, late_ns, early_ns, line.late_limit_ns)
+        if images and not line.settled:
+            return self._leave_grid(slot, stamp_ns)
         if images:
             before_ns = line.at(slot)
             self._restart(images)
@@ -265,17 +269,24 @@ class FrameClock:
     def _counts_lost(self) -> bool:
         return self._info.sequence_counts_lost and self._fields == 1
 
-    def _believe(self, by_time: int, by_sequence: int) -> int:
-        """Return how many images are missing where the sequence should know."""
+    def _believe(self, by_time: int, by_sequence: int) -> tuple[int, bool]:
+        """Return how many images are missing where the sequence should know, and whether the
+        stamps leave the grid: ever later, though nothing is missing."""
         if by_sequence >= by_time:
-            self._doubts = 0
+            self._doubts.clear()
             # A stamp may be late but not early: more do not fit into the interval.
-            return by_time if self._line.settled else by_sequence
-        self._doubts += 1
-        if self._doubts < DISTRUST:
-            return by_sequence
-        self._doubts = 0
-        return by_time
+            return (by_time if self._line.settled else by_sequence), False
+        self._doubts.append(by_time)
+        if len(self._doubts) < DISTRUST:
+            return by_sequence, False
+        later = self._doubts[-1] > self._doubts[0]
+        self._doubts.clear()
+        return by_time, later
+
+    def _leave_grid(self, slot: int, stamp_ns: int) -> int:
+        """Give each image its own stamp's time until they come evenly again."""
+        self._change_pace(slot, stamp_ns, Pace.UNEVEN, self._period_ns)
+        return slot
 
     def _on_its_turn(self, slot: int, missed: int, scan: Scan) -> int:
         """Return the number missed with which an alternating field comes in its turn."""
@@ -302,7 +313,8 @@ class FrameClock:
             self._line.add(slot, stamp_ns)
         self._phase.forget()
         self._cadence.forget()
-        self._doubts, self._just_missed = 0, 0
+        self._doubts.clear()
+        self._just_missed = 0
 
     def _change_pace(self, slot: int, stamp_ns: int, pace: Pace, period_ns: Fraction) -> None:
         """Go on at another period, or without one."""
@@ -310,12 +322,16 @@ class FrameClock:
         self._free = pace is Pace.UNEVEN
         if pace is Pace.OTHER:
             self._missed -= sum(self._lately_missed)
+            self._lately_missed.clear()
             why = (
                 f"images come at {float(10**9 / period_ns):.3f} Hz and not at {said_hz:.3f} Hz; "
                 "look whether the camera's standard and rate are those of the configuration"
             )
         elif self._free:
-            why = "images come at uneven intervals; each has its own stamp's time"
+            why = (
+                f"images do not come at an even {said_hz:.3f} Hz; each has its own stamp's time "
+                "until they come evenly"
+            )
         else:
             why = f"images come at an even {said_hz:.3f} Hz again"
         self._set_period(period_ns)
@@ -354,9 +370,12 @@ class FrameClock:
         """Undo the last call of images missed: they were held up and come now."""
         missed = self._just_missed
         self._taken_back += 1
+        self._line.take_back(slot)
+        self._phase.forget()
         self._missed -= missed
         self._shift += missed
         self._just_missed = 0
+        self._lately_missed.append(-missed)
         held_ms = (stamp_ns - self._line.at(slot - missed)) / 1e6
         self._jump(f"the last {missed} called missed came after all, held up for {held_ms:.0f} ms")
         return slot - missed

@@ -34,6 +34,7 @@ _TOO_EARLY = -5.0
 """Times the root of the clip: twice as deep as uniform noise reaches below its line."""
 _LEAST_ACTIVE = 12
 """So many stamps must be less late than the clip, else the covariance is a guess."""
+_SCALE_FLOOR_NS = 1e3
 _BLOCK = 32
 """Lateness may hang together over a second."""
 
@@ -114,7 +115,8 @@ def fit(
             # The prior's weight, in units in which each active stamp weighs 1.
             ridge = (float(psi @ psi) / count if clip else scale**2) / prior.sigma**2
         sx, sxx = float(active @ x), float(active @ square) + ridge
-        determinant = count * sxx - sx * sx
+        # count * sxx - sx * sx, which loses all its digits where few stamps are active
+        determinant = count * (float(active @ (x - sx / count) ** 2) + ridge)
         force = float(psi.sum())
         torque = float(psi @ x) - ridge * (slope - prior.mean)
         d_level = (force * sxx - torque * sx) / determinant
@@ -198,7 +200,7 @@ def lateness(residual: Floats, before: Lateness, weight: float) -> Lateness:
         # Whether the edge is a sharp one is not to be seen yet.
         sigma = max(sigma, 0.15 * above)
     return Lateness(
-        scale_ns=scale,
+        scale_ns=max(scale, _SCALE_FLOOR_NS),
         deviation_ns=math.sqrt(
             (weight * before.deviation_ns**2 + n * float(np.var(r))) / (weight + n)
         ),

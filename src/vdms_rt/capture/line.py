@@ -29,11 +29,13 @@ ENOUGH_NS = 5e3
 DRIFT = 5e-9
 """Change of the rate in a second that goes unseen: 0.3 ppm a minute, of a quartz that warms up."""
 RATE_PRIOR = 100e-6
-"""Standard deviation of the rate of a source that was not seen before, or has changed."""
+"""Standard deviation of the rate of a source that was not seen before."""
 RATE_LOOSE = 0.02
 """The same once the first has proved wrong: the source runs at another nominal rate."""
 RATE_KNOWN = 5e-6
-"""What the rate of a source may change by in a pause."""
+"""What the rate of a source may change by in a pause, and"""
+RATE_CHANGED = 20e-6
+"""where its stamps no longer agree with those before."""
 SIGMA_FLOOR_NS = 2e3
 """What quartz and interrupts leave, however many stamps there are."""
 SETTLED = 48
@@ -53,6 +55,11 @@ _MANY = 960
 """stamps."""
 _CHANGED = 5.0
 """Standard deviations by which the latest stamps must differ from the rest."""
+_EARLIEST = (0.02, 0.05)
+_UNEVEN = 2.1
+"""Most that the earliest stamps may run ahead of their even spread over time, in the units of
+Kolmogorov's distribution; about a line fitted to them 99 % stay below 1.6."""
+_LEAST_KEPT = 32
 
 
 class StampLine:
@@ -63,7 +70,8 @@ class StampLine:
     """
 
     def __init__(self, period_ns: Fraction) -> None:
-        self._period_ns, self._period = period_ns, float(period_ns)
+        self._period = float(period_ns)
+        self._numerator, self._denominator = period_ns.numerator, period_ns.denominator
         self._x = np.zeros(2 * WINDOW, dtype=np.int64)
         self._y = np.zeros(2 * WINDOW)
         self._first = self._end = 0
@@ -74,7 +82,11 @@ class StampLine:
         self._middle = 0
         self._depth_ns = 0.0
         self._held_scale_ns: float | None = None
+        self._least_variance = SIGMA_FLOOR_NS**2
+        self._early_limit_ns = self._period / 4
         self._votes = 0
+        self._since = 0
+        """Stamps since the last fit."""
         self._until_next = 0
         self._until_choice = 0
 
@@ -100,17 +112,12 @@ class StampLine:
     @property
     def early_limit_ns(self) -> float:
         """By how much a stamp may come before `at`, positive."""
-        quarter_ns = self._period / 4
-        if not self.settled:
-            return quarter_ns
-        below = max(0.0, self._depth_ns - self._lateness.edge_ns - self._lateness.earliest_ns)
-        sigma = self.sigma_ns(int(self._x[self._end - 1]))
-        return min(quarter_ns, EARLY_LIMIT_NS + 2 * below + 6 * sigma)
+        return self._early_limit_ns
 
     @property
     def late_limit_ns(self) -> float:
         """By how much a stamp comes after `at` at most, but for a rare one."""
-        return self._lateness.q99_ns + LATE_LIMIT_NS
+        return self._lateness.q99_ns + LATE_LIMIT_NS if self.settled else math.inf
 
     def begin(self, index: int, stamp_ns: int) -> None:
         """Start anew at a stamp; what was learnt of rate and lateness is kept."""
@@ -137,11 +144,18 @@ class StampLine:
         self._y[self._end] = stamp_ns - self._origin_ns - self._grid_ns(index)
         self._end += 1
         self._first = max(self._first, self._end - WINDOW)
+        self._since += 1
         self._until_next -= 1
         if self._until_next > 0 and self.count > 8:
             return 0.0
         self._until_next = min(_EVERY, self.count // 8)
         return self._evaluate()
+
+    def take_back(self, index: int) -> None:
+        """Forget the latest stamp if it was this index's, which it was not in truth."""
+        if self.count > 1 and self._x[self._end - 1] == index:
+            self._end -= 1
+            self._until_next = 0
 
     def at(self, index: int) -> int:
         """Return the time of an index in nanoseconds."""
@@ -151,9 +165,7 @@ class StampLine:
 
     def sigma_ns(self, index: int) -> float:
         """Return the standard deviation of `at(index)`, a constant delay aside."""
-        span_s = self.count * self._period / 1e9
-        bend_ns = DRIFT * span_s * span_s / 12 * 1e9
-        return math.sqrt(self._variance(index) + bend_ns * bend_ns + SIGMA_FLOOR_NS**2)
+        return math.sqrt(self._variance(index) + self._least_variance)
 
     def _variance(self, index: int) -> float:
         x = index - self._middle
@@ -162,19 +174,30 @@ class StampLine:
         return self._line.variance(x)
 
     def _grid_ns(self, index: int) -> int:
-        return index * self._period_ns.numerator // self._period_ns.denominator
+        return index * self._numerator // self._denominator
 
     def _evaluate(self) -> float:
         latest = int(self._x[self._end - 1])
-        before_ns = self.at(latest)
-        changed = self._change(self._refit())
-        while changed:
-            self._first = self._end - changed
-            self._prior = Prior(self._line.slope, RATE_PRIOR * self._period)
+        before, before_ns, sigma_ns = self._line, self.at(latest), self.sigma_ns(latest)
+        keep = _to_keep(self._refit())
+        moved = abs(self.at(latest) - before_ns) > _CHANGED * sigma_ns
+        if not keep and moved and self.count >= SHAPE_KNOWN:
+            keep = max(self._since, _LEAST_KEPT)
+        while keep:
+            self._first = self._end - keep
+            sigma = math.hypot(RATE_CHANGED * self._period, math.sqrt(before.var_slope))
+            self._prior = Prior(before.slope, sigma)
             self._weight, self._votes = 8.0, 0
-            changed = self._change(self._refit())
+            keep = _to_keep(self._refit())
+        self._since = 0
         if self.count > ENOUGH and self._variance(latest) < ENOUGH_NS**2:
             self._first += (self.count - ENOUGH) // 4
+        span_s = self.count * self._period / 1e9
+        bend_ns = DRIFT * span_s * span_s / 12 * 1e9
+        self._least_variance = bend_ns * bend_ns + SIGMA_FLOOR_NS**2
+        below = max(0.0, self._depth_ns - self._lateness.edge_ns - self._lateness.earliest_ns)
+        limit_ns = EARLY_LIMIT_NS + 2 * below + 6 * self.sigma_ns(latest)
+        self._early_limit_ns = min(self._period / 4, limit_ns)
         return float(self.at(latest) - before_ns)
 
     def _refit(self) -> Floats:
@@ -226,23 +249,29 @@ class StampLine:
             self._depth_ns = reported - best.level
         return best
 
-    def _change(self, residual: Floats) -> int:
-        """Return how many of the latest stamps to keep because early stamps have become more
-        frequent or rarer than they were; 0 if all agree."""
-        n = len(residual)
-        if n < SHAPE_KNOWN:
-            return 0
-        early = residual < np.partition(residual, n // 10)[n // 10]
-        worst, keep = _CHANGED, 0
-        recent = 64
-        while recent <= n // 2:
-            z = _surprise(int(early[-recent:].sum()) / recent, 0.1, recent) * math.sqrt(
-                1 - recent / n
-            )
-            if z > worst:
-                worst, keep = z, recent
-            recent *= 2
-        return keep
+
+def _to_keep(residual: Floats) -> int:
+    """Return how many of the latest stamps to keep because the early ones are not spread evenly
+    over time, 0 if they are."""
+    n = len(residual)
+    if n < SHAPE_KNOWN:
+        return 0
+    early = residual < np.partition(residual, n // 10)[n // 10]
+    recent = 64
+    while recent <= n // 2:
+        part = int(early[-recent:].sum()) / recent
+        if _surprise(part, 0.1, recent) * math.sqrt(1 - recent / n) > _CHANGED:
+            # Where early ones have become rare, the last of them was before the change.
+            since = int(np.argmax(early[::-1])) if part < 0.1 else recent
+            return max(min(since, recent), _LEAST_KEPT)
+        recent *= 2
+    for part in _EARLIEST:
+        count = int(part * n)
+        excess = np.abs(np.cumsum((residual < np.partition(residual, count)[count]) - count / n))
+        most = int(np.argmax(excess))
+        if excess[most] > _UNEVEN * math.sqrt(part * (1 - part) * n):
+            return max(n - 1 - most, _LEAST_KEPT)
+    return 0
 
 
 def _surprise(part: float, expected: float, n: int) -> float:
