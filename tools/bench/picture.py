@@ -152,6 +152,8 @@ def disturbed(
         pixel = 1 / sqrt(ellipse.half_height * ellipse.half_chord)
         at = rng.uniform(0, 2 * pi)
         across = u * cos(at) + v * sin(at)
+        # Nothing of it reaches the next disc.
+        here = np.maximum(abs(u), abs(v)) < 1.6
         match kind:
             case "glare":
                 r, size = rng.uniform(0.6, 1.1), rng.uniform(0.1, 0.4)
@@ -166,17 +168,15 @@ def disturbed(
             case "wire":
                 off, width = rng.uniform(-0.8, 0.8), rng.uniform(1.0, 5.0) * pixel
                 level = rng.choice([bench.black_grey, 0.5 * bench.white_grey, bench.white_grey])
-                out += (level - out) * _soft(width / 2 - abs(across - off), pixel)
+                out += (level - out) * here * _soft(width / 2 - abs(across - off), pixel)
             case "shadow":
                 lit = _soft(across - rng.uniform(-0.6, 0.6), pixel * rng.uniform(1, 6))
-                inside = np.hypot(u, v) < 1.6
-                out *= np.where(inside, 1 - rng.uniform(0.2, 0.7) * (1 - lit), 1)
+                out *= np.where(here, 1 - rng.uniform(0.2, 0.7) * (1 - lit), 1)
             case "gradient":
-                inside = np.maximum(abs(u), abs(v)) < 1.6
-                out *= np.where(inside, 1 + slope * (u * cos(heading) + v * sin(heading)), 1)
+                out *= np.where(here, 1 + slope * (u * cos(heading) + v * sin(heading)), 1)
             case "cut":
                 # The chord that cuts off 20 % of a circle lies at 0.4920 of its radius.
-                out += (bench.black_grey - out) * _soft(across - 0.4920, pixel)
+                out += (bench.black_grey - out) * here * _soft(across - 0.4920, pixel)
             case _:
                 raise ValueError(f"no disturbance is called {kind}; known: {DISTURBANCES}")
     return out

@@ -67,6 +67,8 @@ class Capture:
         self._ring = ring
         self._report = report
         self._on_truth = on_truth
+        self._again = config.source == "v4l2"
+        """A device comes back; a file that cannot be read is not better a second later."""
         self._clock: FrameClock | None = None
         self._clock_for: object = None
         self._exposure_ns = 0
@@ -78,7 +80,7 @@ class Capture:
 
     def run(self, stop: threading.Event) -> None:
         """Fill the ring until `stop` is set or the source ends, then close it: the body of the
-        capture thread. A live source that fails is opened again for ever."""
+        capture thread. A device that fails is opened again for ever."""
         try:
             while not stop.is_set() and not self.counters.ended:
                 source = self._open(stop)
@@ -94,7 +96,7 @@ class Capture:
         try:
             source = open_source(self._config, self._on_truth)
         except SourceError as error:
-            if not self._ring.live:
+            if not self._again:
                 self.counters.ended = True
                 self.counters.failure = str(error)
                 return None
@@ -137,7 +139,7 @@ class Capture:
             except SourceError as error:
                 self._ring.abandon(slot)
                 self._lost(error)
-                stop.wait(RETRY_S if self._ring.live else 0)
+                stop.wait(RETRY_S if self._again else 0)
                 return
             if grab is None:
                 self._ring.abandon(slot)
@@ -209,7 +211,7 @@ class Capture:
         return self._last
 
     def _lost(self, error: SourceError) -> None:
-        if not self._ring.live:
+        if not self._again:
             self.counters.ended = True
             self.counters.failure = str(error)
             return
