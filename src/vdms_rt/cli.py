@@ -149,6 +149,54 @@ def _parser() -> argparse.ArgumentParser:
 
     verb = _verb(
         verbs,
+        "lens",
+        _lens,
+        "find what the lens bends, from a recording",
+        "Record while the marker is moved slowly in its own plane, as far across the picture as it "
+        "goes, also up and down, before a camera that stands still. Prints the distortion, how "
+        "sure it is, what it does in millimetres, and the section [lens] for the configuration.",
+    )
+    verb.add_argument("file", type=Path, metavar="RECORDING")
+    verb.add_argument("--marker", metavar="NAME", help="where several markers moved")
+    verb.add_argument(
+        "--pixel-aspect",
+        type=_pixel_aspect,
+        metavar="N",
+        help="pixels along a row over pixels along a column for the same length (default: as "
+        "configured for the recording)",
+    )
+
+    verb = _verb(
+        verbs,
+        "stroke",
+        _stroke,
+        "find the table's axis and check the scale, from a recording",
+        "Record a slow stroke of known length from one rest to another, half a second or more at "
+        "each end, to and fro if you like. Prints the angle of the axis, the scale with its "
+        "standard error, and the key axis_deg for the configuration.",
+    )
+    verb.add_argument("file", type=Path, metavar="RECORDING")
+    verb.add_argument(
+        "--stroke-mm",
+        type=_stroke_mm,
+        required=True,
+        metavar="MM",
+        help="true distance between the rests at both ends",
+    )
+    verb.add_argument("--marker", metavar="NAME", help="where several markers moved")
+    verb.add_argument(
+        "--from-s",
+        type=_seconds,
+        default=0.0,
+        metavar="S",
+        help="begin so long after the first sample",
+    )
+    verb.add_argument(
+        "--to-s", type=_seconds, default=math.inf, metavar="S", help="end so long after it"
+    )
+
+    verb = _verb(
+        verbs,
         "watch",
         _watch,
         "show a running station's displacement in this terminal",
@@ -185,6 +233,14 @@ def _seconds(text: str) -> float:
 
 def _millimetres(text: str) -> float:
     return _number(text, 1.0, 10000.0, "millimetres, between 1 and 10000")
+
+
+def _stroke_mm(text: str) -> float:
+    return _number(text, 0.01, 10000.0, "millimetres, between 0.01 and 10000")
+
+
+def _pixel_aspect(text: str) -> float:
+    return _number(text, 0.5, 2.0, "0.5 to 2")
 
 
 def _number(text: str, least: float, most: float, rule: str) -> float:
@@ -246,6 +302,28 @@ def _marker(arguments: argparse.Namespace) -> int:
         white_on_black=not arguments.black_on_white,
     )
     print(write_sheet(shape, arguments.out))
+    return EXIT_STOPPED
+
+
+def _lens(arguments: argparse.Namespace) -> int:
+    from vdms_rt.calibrate import lens_from_recording
+
+    print(lens_from_recording(arguments.file, arguments.marker, arguments.pixel_aspect))
+    return EXIT_STOPPED
+
+
+def _stroke(arguments: argparse.Namespace) -> int:
+    from vdms_rt.calibrate import stroke_from_recording
+
+    print(
+        stroke_from_recording(
+            arguments.file,
+            arguments.marker,
+            arguments.stroke_mm,
+            arguments.from_s,
+            arguments.to_s,
+        )
+    )
     return EXIT_STOPPED
 
 
