@@ -318,7 +318,7 @@ class Publish(Section):
     """peer listens itself; client needs a router at `connect`."""
     listen: tuple[str, ...] = ("tcp/0.0.0.0:7447",)
     connect: tuple[str, ...] = ()
-    recover_s: float = Field(default=60.0, ge=1, le=3600)
+    recover_s: float = Field(default=60.0, ge=1, le=600)
     """How long samples are kept for subscribers whose link was down."""
 
 

@@ -14,7 +14,7 @@ from vdms_rt.measure.expect import Expected
 from vdms_rt.measure.gate import FEW_PIXELS, Gate, Shape, Workspace, fill_boxes
 from vdms_rt.model import Luma
 
-EFFICIENCY = 1.05
+EFFICIENCY = 1.03
 """Standard deviation of this centroid over the Cramer-Rao bound, for the whole bench."""
 EDGE_REACH_PX = 2.2
 """Of the blurred edge beside its middle, with what the rounding to whole pixels adds."""

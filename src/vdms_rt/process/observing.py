@@ -12,12 +12,14 @@ from vdms_rt.measure.centroid import otsu_circle
 from vdms_rt.measure.expect import Forecast
 from vdms_rt.measure.gate import Workspace
 from vdms_rt.measure.homography import jacobian_mm_per_px, to_image_px
+from vdms_rt.measure.lens import Lens, undistort_px
 from vdms_rt.measure.motion import mean_displacement, mean_rotation_mrad
 from vdms_rt.measure.observe import motion_of, observe
 from vdms_rt.measure.rigid import position_covariance
+from vdms_rt.measure.smooth import CircleReading
 from vdms_rt.measure.validity import Limits
 from vdms_rt.model import UNUSABLE_CIRCLE, Circle, CircleFlag, MarkerShape, Picture, Status
-from vdms_rt.process.progress import GONE, View, Watch
+from vdms_rt.process.progress import GONE, View, Watch, spread_matrices
 from vdms_rt.process.reference import circle_of, region_at
 from vdms_rt.process.track import REST, Pose, Track
 
@@ -72,10 +74,11 @@ def _paper(shape: MarkerShape, watch: Watch, view: View, picture: Picture) -> tu
     good = [n for n, c in enumerate(circles) if not c.flags & UNUSABLE_CIRCLE]
     if len(good) < 3:
         return Seen(circles, None, UNKNOWN, math.nan, REST, Status.NOT_FOUND), watch
-    centres = np.array([(circles[n].x_px, circles[n].y_px) for n in good])
+    seen_px = np.array([(circles[n].x_px, circles[n].y_px) for n in good])
+    centres = undistort_px(watch.lens, seen_px)
     zero_mm = view.zero_mm[good]
-    x_mm, y_mm, residual_mm = mean_displacement(watch.homography, centres, zero_mm)
-    rotation_mrad = mean_rotation_mrad(watch.homography, centres, zero_mm)
+    x_mm, y_mm, residual_mm = mean_displacement(watch.ideal, centres, zero_mm)
+    rotation_mrad = mean_rotation_mrad(watch.ideal, centres, zero_mm)
     status = Status.FEWER_CIRCLES if len(good) < len(circles) else Status.OK
     return Seen(circles, (x_mm, y_mm, rotation_mrad), UNKNOWN, residual_mm, REST, status), watch
 
@@ -102,7 +105,9 @@ def _smooth(
         height_px,
     )
     tolerance_mm = BENT_PX * view.mm_per_px + BENT_MM_PER_MM * math.hypot(pose[0], pose[1])
-    observation = motion_of(readings, flags, watch.homography, view.zero_mm, tolerance_mm)
+    observation = motion_of(
+        _undistorted(watch.lens, readings), flags, watch.ideal, view.zero_mm, tolerance_mm
+    )
     circles = tuple(circle_of(r, f) for r, f in zip(readings, observation.flags, strict=True))
     motion = observation.motion
     if motion is None:
@@ -143,12 +148,24 @@ def _smooth(
     return seen, after
 
 
+def _undistorted(lens: Lens | None, readings: list[CircleReading]) -> list[CircleReading]:
+    """Return the readings with their centres where a lens that bends nothing would show them."""
+    if lens is None:
+        return readings
+    ideal = undistort_px(
+        lens,
+        np.array([(r.x_px, r.y_px) for r in readings]),
+        spread_matrices([r.moments_px2 for r in readings]),
+    )
+    return [r._replace(x_px=x, y_px=y) for r, (x, y) in zip(readings, ideal.tolist(), strict=True)]
+
+
 def relocated(watch: Watch, centres_px: tuple[tuple[float, float], ...], t_ns: int) -> Watch:
     """Return a lost marker's watch after a search has found its circles again."""
     (view, *_) = watch.views.values()
-    centres = np.array(centres_px)
-    x_mm, y_mm, _ = mean_displacement(watch.homography, centres, view.zero_mm)
-    turn = mean_rotation_mrad(watch.homography, centres, view.zero_mm)
+    centres = undistort_px(watch.lens, np.array(centres_px))
+    x_mm, y_mm, _ = mean_displacement(watch.ideal, centres, view.zero_mm)
+    turn = mean_rotation_mrad(watch.ideal, centres, view.zero_mm)
     return dataclasses.replace(
         watch,
         track=Track(((t_ns, (x_mm, y_mm, turn)),)),

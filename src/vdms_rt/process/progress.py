@@ -7,16 +7,21 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vdms_rt.config import Config
+from vdms_rt.config import Lens as LensSection
 from vdms_rt.measure.expect import Forecast
 from vdms_rt.measure.fieldorder import OrderEvidence
+from vdms_rt.measure.gate import Shape
 from vdms_rt.measure.homography import (
     Matrix,
+    homography,
     reference_covariance_mm2,
     scale_px_per_mm,
     to_marker_mm,
 )
+from vdms_rt.measure.lens import Lens, lens_for, undistort_px
 from vdms_rt.measure.rigid import Covariances
 from vdms_rt.measure.smooth import CircleReading, Slow
 from vdms_rt.measure.validity import Limits
@@ -43,6 +48,7 @@ class Plan:
     regions: tuple[tuple[Region, ...], ...]
     """For each marker those of the configuration; empty where it is to be found."""
     axes_deg: tuple[float, ...]
+    lens: LensSection
     reference_pictures: int
     still_px: float
     stale_px: float
@@ -54,6 +60,7 @@ class Plan:
             shapes=tuple(m.shape for m in config.marker),
             regions=tuple(m.regions if m.find == "regions" else () for m in config.marker),
             axes_deg=tuple(m.axis_deg for m in config.marker),
+            lens=config.lens,
             reference_pictures=config.setup.reference_pictures,
             still_px=config.setup.still_px,
             stale_px=config.setup.stale_px,
@@ -79,6 +86,10 @@ class Watch:
     """What is known of one marker from picture to picture."""
 
     homography: Matrix
+    """To pixels as the lens shows them: tells where circles are seen."""
+    ideal: Matrix
+    """To pixels as a lens that bends nothing would show them: tells millimetres."""
+    lens: Lens | None
     views: dict[Scan, View]
     slow: dict[Scan, Slow]
     regions: tuple[Region, ...]
@@ -147,19 +158,58 @@ def lost_long(watch: Watch) -> bool:
 GONE = -1
 
 
-def watches_of(set_up: SetUp, exposure_ns: int, period_ns: int) -> tuple[Watch, ...]:
+def watches_of(set_up: SetUp, plan: Plan, exposure_ns: int, period_ns: int) -> tuple[Watch, ...]:
     """Return what measuring against a set-up begins with.
 
-    `exposure_ns` is of a field, `period_ns` of a frame.
+    `exposure_ns` is of a field, `period_ns` of a frame. Raises ConfigError for a lens that does not
+    fit the picture.
     """
-    return tuple(_watch(m, set_up, exposure_ns, period_ns) for m in set_up.markers)
+    lens = lens_for(
+        plan.lens.k1,
+        plan.lens.k2,
+        plan.lens.centre_px,
+        plan.lens.pixel_aspect,
+        set_up.width_px,
+        set_up.height_px,
+    )
+    exposure_s = exposure_ns / 1e9
+    if set_up.scan.interlaced:
+        # In a whole frame two fields, a quarter of a period before and after the middle, smear as
+        # an exposure of the same variance does.
+        woven_s = (exposure_s**2 + 12 * (period_ns / 4e9) ** 2) ** 0.5
+    else:
+        woven_s = exposure_s
+    return tuple(_watch(m, set_up, lens, exposure_s, woven_s) for m in set_up.markers)
 
 
-def _watch(marker: MarkerSetUp, set_up: SetUp, exposure_ns: int, period_ns: int) -> Watch:
+def _watch(
+    marker: MarkerSetUp, set_up: SetUp, lens: Lens | None, exposure_s: float, woven_s: float
+) -> Watch:
     h = np.array(marker.homography)
+    circles_mm = np.array(marker.shape.circles_mm)
+    kinds_px = [_ideal_px(lens, f) for f in marker.fields]
+    reference_px = np.mean(kinds_px, axis=0)
+    ideal = homography(circles_mm, reference_px) if lens else h
+    one = marker.noise_px**2 / set_up.stills * np.eye(2)
+    variance = np.broadcast_to(one, (len(circles_mm), 2, 2))
+    views = {}
+    for field_, at_px in zip(marker.fields, kinds_px, strict=True):
+        forecast = None
+        if field_.appearance is not None:
+            whole = field_.kind is Scan.PROGRESSIVE
+            forecast = Forecast(field_.appearance, h, woven_s if whole else exposure_s)
+        views[field_.kind] = View(
+            zero_mm=to_marker_mm(ideal, at_px),
+            covariance_mm2=reference_covariance_mm2(circles_mm, reference_px, variance, at_px),
+            mm_per_px=1 / max(scale_px_per_mm(h)),
+            forecast=forecast,
+            limits=field_.limits,
+        )
     return Watch(
         homography=h,
-        views={f.kind: _view(f, marker, set_up, h, exposure_ns, period_ns) for f in marker.fields},
+        ideal=ideal,
+        lens=lens,
+        views=views,
         slow={
             f.kind: Slow(f.appearance.variance_grey2, f.appearance.edge_px)
             for f in marker.fields
@@ -169,33 +219,13 @@ def _watch(marker: MarkerSetUp, set_up: SetUp, exposure_ns: int, period_ns: int)
     )
 
 
-def _view(
-    field_: FieldSetUp,
-    marker: MarkerSetUp,
-    set_up: SetUp,
-    h: Matrix,
-    exposure_ns: int,
-    period_ns: int,
-) -> View:
-    exposure_s = exposure_ns / 1e9
-    if field_.kind is Scan.PROGRESSIVE and set_up.scan.interlaced:
-        # Two fields a quarter of a period before and after the middle smear as an exposure of the
-        # same variance does.
-        exposure_s = (exposure_s**2 + 12 * (period_ns / 4e9) ** 2) ** 0.5
-    forecast = None
-    if field_.appearance is not None:
-        forecast = Forecast(field_.appearance, h, exposure_s)
-    at_px = np.array(field_.reference_px)
-    variance = marker.noise_px**2 / set_up.stills * np.eye(2)
-    return View(
-        zero_mm=to_marker_mm(h, at_px),
-        covariance_mm2=reference_covariance_mm2(
-            np.array(marker.shape.circles_mm),
-            np.array(marker.reference_px),
-            np.broadcast_to(variance, (len(at_px), 2, 2)),
-            at_px,
-        ),
-        mm_per_px=1 / max(scale_px_per_mm(h)),
-        forecast=forecast,
-        limits=field_.limits,
-    )
+def _ideal_px(lens: Lens | None, field_: FieldSetUp) -> Points:
+    seen_px = np.array(field_.reference_px)
+    if field_.appearance is None:
+        return undistort_px(lens, seen_px)
+    return undistort_px(lens, seen_px, spread_matrices(field_.appearance.moments_px2))
+
+
+def spread_matrices(moments_px2: Sequence[Shape]) -> NDArray[np.float64]:
+    """Return second central moments (xx, xy, yy) as matrices, (n, 2, 2)."""
+    return np.array([((xx, xy), (xy, yy)) for xx, xy, yy in moments_px2])

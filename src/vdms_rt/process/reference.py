@@ -175,7 +175,9 @@ def _referenced(
             progress,
             phase=Phase.MEASURING,
             set_up=set_up,
-            watches=watches_of(set_up, picture.exposure_ns, picture.period_ns * picture.row_step),
+            watches=watches_of(
+                set_up, progress.plan, picture.exposure_ns, picture.period_ns * picture.row_step
+            ),
             revision=set_up.revision,
             stills=(),
             waiting=False,

@@ -54,7 +54,7 @@ def begin(
             progress,
             phase=Phase.CHECKING,
             set_up=stored,
-            watches=watches_of(stored, exposure_ns, period_ns),
+            watches=watches_of(stored, plan, exposure_ns, period_ns),
             revision=max(revision, stored.revision),
             regions=tuple(m.regions for m in stored.markers),
             order=stored.scan if stored.order_proved else None,
