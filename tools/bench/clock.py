@@ -202,7 +202,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20, help="records for each driver")
     parser.add_argument("--seconds", type=float, default=120.0, help="length of a record")
     chosen = parser.parse_args()
-    print(f"{chosen.seeds} records of {chosen.seconds:g} s for each driver, 1 % of frames lost")
+    print(
+        f"{chosen.seeds} records of {chosen.seconds:g} s for each driver; 50 ppm off, 1 % of frames lost"
+    )
     print(
         f"{'':26s} after 60 s, us: beside a         within 2 sigma  frames    refit, us      cost\n"
         f"{'stamps late by':26s} constant  worst    delay   % late  % all counted     rms   worst"

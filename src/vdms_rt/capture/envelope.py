@@ -180,17 +180,16 @@ def fits(
 
 
 def lateness(residual: Floats, before: Lateness, weight: float) -> Lateness:
-    """Return how residuals are distributed; with few of them `before` counts as `weight` more."""
+    """Return how residuals are distributed; while they are few `before` counts as `weight` more."""
     r = np.sort(residual)
     n = len(r)
-    quartiles = 0.7413 * float(r[3 * n // 4] - r[n // 4])
-    scale = math.sqrt((weight * before.scale_ns**2 + n * quartiles**2) / (weight + n))
     middle = float(r[n // 2])
     if n < FEW:
         above = (weight * before.median_ns + (n + 1) * (middle - float(r[0]))) / (weight + n - 1)
         gap = 2 * above / (n + 1)
-        edge, sigma = float(r[0]) - gap, gap * (1 + 1 / n)
+        edge, sigma = float(r[0]) - gap, gap * (1 + 4 / (n + 2))
     else:
+        weight = 0.0
         # Not the very first where there are many: a few may be earlier than should be.
         k = min(4, n // 128)
         gap = float(r[k + 8] - r[k]) / 8
@@ -199,15 +198,18 @@ def lateness(residual: Floats, before: Lateness, weight: float) -> Lateness:
     if n < SHAPE_KNOWN:
         # Whether the edge is a sharp one is not to be seen yet.
         sigma = max(sigma, 0.15 * above)
+
+    def together(own: float, known: float) -> float:
+        return math.sqrt((weight * known**2 + n * own**2) / (weight + n))
+
+    quartiles = 0.7413 * float(r[3 * n // 4] - r[n // 4])
     return Lateness(
-        scale_ns=max(scale, _SCALE_FLOOR_NS),
-        deviation_ns=math.sqrt(
-            (weight * before.deviation_ns**2 + n * float(np.var(r))) / (weight + n)
-        ),
+        scale_ns=max(together(quartiles, before.scale_ns), _SCALE_FLOOR_NS),
+        deviation_ns=together(float(np.std(r)), before.deviation_ns),
         edge_ns=edge,
         edge_sigma_ns=sigma,
         earliest_ns=float(r[0]) - edge,
         median_ns=above,
-        q99_ns=max(float(r[99 * n // 100]) - edge, before.q99_ns if n < FEW else 0.0),
+        q99_ns=max(float(r[99 * n // 100]) - edge, before.q99_ns if weight else 0.0),
         softness=(float(r[n // 20]) - edge) / above if above > 0 else 0.0,
     )

@@ -41,8 +41,13 @@ SIGMA_FLOOR_NS = 2e3
 SETTLED = 48
 """Stamps after which one that does not fit is the source's doing, not the line's."""
 EARLY_LIMIT_NS = 0.5e6
+"""No stamp is earlier by more than this and six standard deviations of the line."""
 LATE_LIMIT_NS = 0.5e6
+"""Few stamps are later than 99 % were by more than this."""
 
+_UNSEEN_WEIGHT = 3.0
+_SEEN_WEIGHT = 8.0
+"""Stamps that the lateness known beforehand counts for, of a driver unseen or seen."""
 _SHARP_KNOWN = 1024
 _SHARP = 0.15
 """Softness under which an edge that was none is one again, if so many stamps say it."""
@@ -76,7 +81,8 @@ class StampLine:
         self._y = np.zeros(2 * WINDOW)
         self._first = self._end = 0
         self._origin_ns = 0
-        self._lateness, self._weight = UNSEEN, 1.0
+        self._lateness = self._before = UNSEEN
+        self._weight = _UNSEEN_WEIGHT
         self._prior = Prior(0.0, RATE_PRIOR * self._period)
         self._line = Fit(0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._middle = 0
@@ -122,7 +128,7 @@ class StampLine:
     def begin(self, index: int, stamp_ns: int) -> None:
         """Start anew at a stamp; what was learnt of rate and lateness is kept."""
         if self.count:
-            self._weight = 8.0
+            self._before, self._weight = self._lateness, _SEEN_WEIGHT
             known = math.hypot(RATE_KNOWN * self._period, math.sqrt(self._line.var_slope))
             self._prior = Prior(self._line.slope, min(known, RATE_PRIOR * self._period))
         self._origin_ns = stamp_ns - self._grid_ns(index)
@@ -179,6 +185,7 @@ class StampLine:
     def _evaluate(self) -> float:
         latest = int(self._x[self._end - 1])
         before, before_ns, sigma_ns = self._line, self.at(latest), self.sigma_ns(latest)
+        shape = self._lateness
         keep = _to_keep(self._refit())
         moved = abs(self.at(latest) - before_ns) > _CHANGED * sigma_ns
         if not keep and moved and self.count >= SHAPE_KNOWN:
@@ -187,7 +194,7 @@ class StampLine:
             self._first = self._end - keep
             sigma = math.hypot(RATE_CHANGED * self._period, math.sqrt(before.var_slope))
             self._prior = Prior(before.slope, sigma)
-            self._weight, self._votes = 8.0, 0
+            self._before, self._weight, self._votes = shape, _SEEN_WEIGHT, 0
             keep = _to_keep(self._refit())
         self._since = 0
         if self.count > ENOUGH and self._variance(latest) < ENOUGH_NS**2:
@@ -213,7 +220,7 @@ class StampLine:
             line = self._choose(x, y, scale, start)
         self._line, self._middle = line, middle
         residual: Floats = y - line.level - line.slope * x
-        self._lateness = lateness(residual, self._lateness, self._weight)
+        self._lateness = lateness(residual, self._before, self._weight)
         self._vote(len(x), scale)
         if self._held_scale_ns is None:
             self._depth_ns = self._lateness.edge_ns

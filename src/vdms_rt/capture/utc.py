@@ -122,8 +122,8 @@ class UtcOffset:
             Event(
                 Severity.WARNING,
                 "utc-step",
-                f"The computer's UTC clock was set {way} by {abs(step_ns) / 1e9:.3f} s; "
-                "utc_ns follows it, t_ns does not.",
+                f"the computer's UTC clock was set {way} by {abs(step_ns) / 1e9:.3f} s; "
+                "utc_ns follows it, t_ns does not",
                 now_ns,
                 now_ns + offset_ns,
                 (("step_ns", str(step_ns)),),
