@@ -203,7 +203,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=120.0, help="length of a record")
     chosen = parser.parse_args()
     print(
-        f"{chosen.seeds} records of {chosen.seconds:g} s for each driver; 50 ppm off, 1 % of frames lost"
+        f"{chosen.seeds} records of {chosen.seconds:g} s for each driver; "
+        "its quartz is 50 ppm off and 1 % of the frames are lost, unless it is said"
     )
     print(
         f"{'':26s} after 60 s, us: beside a         within 2 sigma  frames    refit, us      cost\n"

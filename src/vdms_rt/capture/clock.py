@@ -11,6 +11,7 @@ from fractions import Fraction
 from vdms_rt.capture.cadence import STAMPS, Cadence, Pace
 from vdms_rt.capture.line import StampLine
 from vdms_rt.capture.phase import PhaseWatch
+from vdms_rt.capture.turns import FieldTurns
 from vdms_rt.capture.utc import UtcOffset
 from vdms_rt.model import Event, Scan, Severity, SourceInfo, StampEvent, Tick
 
@@ -103,8 +104,7 @@ class FrameClock:
         """Added to a slot it gives the place that was told."""
         self._stamp_ns = 0
         self._sequence = 0
-        self._scan = info.scan
-        self._first_scan: Scan | None = None
+        self._turns = FieldTurns() if self._fields == 2 else None
         self._free = False
         """Images come unevenly: there is no grid."""
         self._just_missed = 0
@@ -131,9 +131,10 @@ class FrameClock:
             self._slot = 0
             self._line.begin(0, stamp_ns)
         else:
-            before, self._slot = self._slot, self._advance(self._slot, stamp_ns, sequence, scan)
-            self._pair(before, self._slot, sequence, scan)
-        self._stamp_ns, self._sequence, self._scan = stamp_ns, sequence, scan
+            self._slot = self._advance(self._slot, stamp_ns, sequence, scan)
+        if self._turns:
+            self._shift += self._turns.shift(self._slot + self._shift, sequence, scan)
+        self._stamp_ns, self._sequence = stamp_ns, sequence
         if self._exact:
             t_ns, self._sigma_ns = stamp_ns, 0.0
         elif self._free:
@@ -241,7 +242,8 @@ class FrameClock:
             missed, lost_count = self._believe(missed, step - 1)
             if lost_count:
                 return self._leave_grid(slot + step, stamp_ns)
-        missed = self._on_its_turn(slot, missed, scan)
+        if self._turns:
+            missed = self._turns.missed(slot + 1 + self._shift, missed, scan)
         self._just_missed = missed
         self._calls += missed > 0
         self._miss(slot, missed)
@@ -287,24 +289,6 @@ class FrameClock:
         """Give each image its own stamp's time until they come evenly again."""
         self._change_pace(slot, stamp_ns, Pace.UNEVEN, self._period_ns)
         return slot
-
-    def _on_its_turn(self, slot: int, missed: int, scan: Scan) -> int:
-        """Return the number missed with which an alternating field comes in its turn."""
-        if self._first_scan is None:
-            return missed
-        second = scan is not self._first_scan
-        if (slot + 1 + missed + self._shift) % 2 == second:
-            return missed
-        return missed - 1 if missed else 1
-
-    def _pair(self, before: int, slot: int, sequence: int, scan: Scan) -> None:
-        """Learn which field begins a frame: the two of one frame share a sequence number."""
-        if self._fields == 1 or self._first_scan is not None:
-            return
-        if slot == before + 1 and scan is not self._scan:
-            paired = sequence == self._sequence
-            self._first_scan = self._scan if paired else scan
-            self._shift += ((before if paired else slot) + self._shift) % 2
 
     def _restart(self, images: list[tuple[int, int]]) -> None:
         """Begin the line anew with slots and stamps that belong together."""

@@ -63,7 +63,7 @@ _CHANGED = 5.0
 _EARLIEST = (0.02, 0.05)
 _UNEVEN = 2.1
 """Most that the earliest stamps may run ahead of their even spread over time, in the units of
-Kolmogorov's distribution; about a line fitted to them 99 % stay below 1.6."""
+Kolmogorov's distribution; about a line fitted to them 99 % stay below 1.7."""
 _LEAST_KEPT = 32
 
 
