@@ -1,12 +1,16 @@
 # Everything a person does with this repository. `make help` lists it.
 
 SECONDS ?= 0
+# `SECONDS` is also a variable of bash, which must not leak in from the environment.
+ifeq ($(origin SECONDS),environment)
+SECONDS := 0
+endif
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test quick check rig soak lock proto clean
+.PHONY: help demo test quick check rig lock proto clean
 
 help: ## list these
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
