@@ -39,6 +39,7 @@ source = "table"
 name = "lab"
 [table]
 stamp_jitter_ms = 1.0
+rest_s = 4.0
 {table}
 [setup]
 directory = "{directory}"
@@ -81,7 +82,7 @@ def only_recording(directory: Path) -> Path:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.CompletedProcess[str], Path]:
     directory = tmp_path_factory.mktemp("demo")
-    done = run("run", "--config", table_config(directory), "--seconds", 8)
+    done = run("run", "--config", table_config(directory), "--seconds", 9)
     return done, only_recording(directory)
 
 
@@ -99,7 +100,7 @@ def test_every_frame_has_its_displacement(
     demo: tuple[subprocess.CompletedProcess[str], Path],
 ) -> None:
     samples = list(messages(demo[1], "displacement"))
-    assert len(samples) > 2 * 8 * 29
+    assert len(samples) > 2 * 9 * 29
     seqs = [s.seq for s in samples]
     assert seqs == list(range(seqs[0], seqs[0] + len(seqs)))
     flags = [bool(s.status & Status.SET_UP) for s in samples]
@@ -147,7 +148,7 @@ def test_the_sigma_of_a_resting_marker_is_true(
 
 def test_the_papers_method_agrees_with_the_truth(tmp_path: Path) -> None:
     config = table_config(tmp_path, extra="[process]\nmethod = 'otsu'\nsampling = 'frame'")
-    assert run("run", "--config", config, "--seconds", 8).returncode == 0
+    assert run("run", "--config", config, "--seconds", 9).returncode == 0
     assert error_3_1(only_recording(tmp_path)) < 0.007
 
 

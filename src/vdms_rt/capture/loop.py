@@ -168,7 +168,7 @@ class Capture:
                     sigma_t_ns=tick.sigma_t_ns,
                     utc_ns=tick.utc_ns,
                     segment=tick.segment,
-                    period_ns=round(source.info.frame_period_s * 1_000_000_000),
+                    period_ns=self._period_ns(source.info),
                     image=slot.view,
                     scan=grab.scan,
                     damage=grab.damage,
@@ -209,6 +209,11 @@ class Capture:
         self.counters.clock = clock.figures
         self.counters.missed = self._missed_before + clock.figures.missed
         return self._last
+
+    def _period_ns(self, info: SourceInfo) -> int:
+        """Return the frame period: what the stamps show, or else what the source says."""
+        shown = self._clock.period_ns if self._clock is not None and self._last.index >= 0 else None
+        return round(info.frame_period_s * 1_000_000_000 if shown is None else shown)
 
     def _lost(self, error: SourceError) -> None:
         if not self._again:
