@@ -44,7 +44,8 @@ SAMPLE_RATE_HZ = 60.0
 STATUS_LINE_S = 0.2
 RATE_WINDOW_S = 3.0
 DRAIN_S = 1.5
-"""For measuring what is in the ring; what then finds no room in the recorder's queue is lost."""
+"""For measuring what is in the ring. After it the rest is given up and counted, and what finds no
+room in the recorder's queue is lost."""
 JOIN_S = 2.5
 """A stop takes less than 3 s; a thread that has not ended by then hangs, and is named."""
 
@@ -178,6 +179,7 @@ class Daemon:
         deadline_s = time.monotonic() + JOIN_S
         threads["capture"].join(JOIN_S)
         threads["process"].join(DRAIN_S)
+        self._ring.drop()
         if recorder is not None:
             recorder.hurry()
         for name in ("process", "find"):

@@ -136,6 +136,16 @@ class Ring:
                 raise RingClosed
             return None
 
+    def drop(self) -> None:
+        """Give up the frames that no reader has taken yet, and count them as overwritten."""
+        with self._changed:
+            self.overwritten += len(self._ready)
+            for slot, _ in self._ready:
+                if slot.image.shape == self._shape:
+                    self._free.append(slot)
+            self._ready.clear()
+            self._changed.notify_all()
+
     def close(self) -> None:
         """No more frames will be written; those in the ring can still be taken."""
         with self._changed:

@@ -166,3 +166,16 @@ def test_a_reader_cannot_write_into_a_frame() -> None:
     write(ring, 0)
     with take(ring) as got, pytest.raises(ValueError, match="read-only"):
         got.image[0, 0] = 1
+
+
+def test_dropped_frames_are_counted_and_their_slots_are_free() -> None:
+    ring = ring_of(2, 2, live=False)
+    for seq in range(64):
+        write(ring, seq)
+    held = take(ring)
+    ring.drop()
+    assert ring.overwritten == 63
+    assert ring.take(0) is None
+    held.release()
+    for seq in range(64):
+        assert write(ring, seq)
