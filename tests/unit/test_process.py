@@ -214,3 +214,15 @@ def test_fields_are_views_in_the_order_of_exposure(scan: Scan, order: tuple[Scan
         assert field.utc_ns - field.t_ns == whole.utc_ns - whole.t_ns
     (as_frame,) = pictures(whole, "frame")
     assert (as_frame.seq, as_frame.t_ns, as_frame.row_step) == (7, whole.t_ns, 1)
+
+
+def test_two_regions_over_one_circle_are_a_configuration_error() -> None:
+    found_ones = Run().reference().progress.regions[0]
+    boxes = [[r.x_px, r.y_px, r.width_px, r.height_px] for r in found_ones]
+    boxes[3] = [boxes[2][0] + 1, boxes[2][1], boxes[2][2], boxes[2][3]]
+    config = parse_config(
+        f'[[marker]]\nfind = "regions"\nregions_px = {boxes}\n[setup]\nreference_pictures = 5',
+        "test",
+    )
+    with pytest.raises(ConfigError, match="regions 3 and 4"):
+        Run(config).reference()

@@ -13,6 +13,7 @@ from vdms_rt.measure.centroid import otsu_circle, otsu_semi_axes
 from vdms_rt.measure.expect import first_look
 from vdms_rt.measure.gate import Workspace
 from vdms_rt.measure.homography import homography
+from vdms_rt.measure.regions import check_circles
 from vdms_rt.measure.smooth import CircleReading, Slow, first_slow, measure, study
 from vdms_rt.measure.still import is_still, noise_px
 from vdms_rt.measure.validity import learn
@@ -20,6 +21,7 @@ from vdms_rt.model import (
     UNUSABLE_CIRCLE,
     Circle,
     CircleFlag,
+    ConfigError,
     Event,
     Picture,
     Region,
@@ -38,7 +40,10 @@ def gather(
     progress: Progress, picture: Picture, work: Workspace
 ) -> tuple[Progress, tuple[tuple[Circle, ...], ...], tuple[Event, ...]]:
     """Return the run after one more picture before the reference, each marker's circles in it, and
-    events. With enough pictures of a resting marker, this takes or checks the reference."""
+    events. With enough pictures of a resting marker, this takes or checks the reference.
+
+    Raises ConfigError when two regions lie over one circle.
+    """
     still = _look(progress, picture, work)
     circles = _by_marker(progress, still.circles)
     if any(c.flags & UNUSABLE_CIRCLE for c in still.circles):
@@ -148,6 +153,9 @@ def _checked(
 def _referenced(
     progress: Progress, picture: Picture, by_kind: dict[Scan, list[Still]]
 ) -> tuple[Progress, tuple[Event, ...]]:
+    last = next(iter(by_kind.values()))[-1]
+    if faults := check_circles(last.circles):
+        raise ConfigError("\n".join(faults))
     markers = []
     first = 0
     for n, (shape, regions) in enumerate(zip(progress.plan.shapes, progress.regions, strict=True)):
