@@ -257,7 +257,8 @@ def _label(shape: MarkerShape, x_mm: float, bottom_mm: float) -> list[Mark]:
     base_mm = bottom_mm - (SHEET_MARGIN / 4) * shape.diameter_mm + 0.35 * size_mm
     text = f"up    vdms-rt {shape.name}    {describe(shape)}"
     _, _, sheet_width_mm, _ = _extent(shape)
-    per_size = stringWidth(text, "Helvetica", 1) + 1
+    # An SVG viewer without Helvetica takes a font up to a fifth wider.
+    per_size = 1.2 * stringWidth(text, "Helvetica", 1) + 1
     size_mm = min(size_mm, 0.9 * sheet_width_mm / per_size)
     left_mm = x_mm - size_mm * per_size / 2
     return [
