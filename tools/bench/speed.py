@@ -28,7 +28,10 @@ from numpy.typing import NDArray
 from tools.bench.picture import Bench, grabbed, woven
 from vdms_rt.config import parse_config
 from vdms_rt.measure.centroid import otsu_circle
+from vdms_rt.measure.expect import Forecast, first_look
 from vdms_rt.measure.gate import Workspace
+from vdms_rt.measure.smooth import Slow, first_slow, measure, study
+from vdms_rt.measure.validity import judge, learn
 from vdms_rt.model import Damage, Displacement, Frame, Region, Scan
 from vdms_rt.process.pictures import pictures
 from vdms_rt.process.progress import Phase, Plan
@@ -243,6 +246,65 @@ def process_stage(method: str, sampling: str, scene: Scene) -> Row:
     return Row(f"process stage, {method}, {counted}", measure, error)
 
 
+def our_smooth(sampling: str, scene: Scene) -> Row:
+    """Return the row of the smooth-weight centroids and their flags alone, told beforehand where
+    the circles should be, as the process stage is by its track."""
+    frames = scene.interlaced if sampling == "field" else scene.whole
+    interlaced = sampling == "field"
+    row_step = 2 if interlaced else 1
+    # In a bottom-first frame the rows 1, 3, ... are the earlier field.
+    parts = ((1, -0.25), (0, 0.25)) if interlaced else ((0, 0.0),)
+    work = Workspace()
+    found = first_look(
+        tuple(map(tuple, BENCH.centres_px().tolist())), ((SIDE_PX / 3, SIDE_PX / 3),) * len(REGIONS)
+    )
+    stills = {
+        offset: [
+            study(image[offset::row_step], offset, row_step, found, first_slow(4), work)
+            for image in scene.stills[:REFERENCE_PICTURES]
+        ]
+        for offset, _ in parts
+    }
+    learnt = learn(stills, row_step)
+    expected, limits, slow = {}, {}, {}
+    for offset, part in parts:
+        appearance, limits[offset] = learnt[offset]
+        forecast = Forecast(appearance, BENCH.homography, 0.0)
+        slow[offset] = Slow(appearance.variance_grey2, appearance.edge_px)
+        for n in range(len(frames)):
+            pose = (position_mm((n + part) / len(frames)), 0.0, 0.0)
+            expected[offset, n] = forecast.at(pose)
+
+    def measure_all(n: int) -> list[list[tuple[float, float]]]:
+        n %= len(frames)
+        given = []
+        for offset, _ in parts:
+            at = expected[offset, n]
+            readings, slow[offset] = measure(
+                frames[n][offset::row_step], offset, row_step, at, slow[offset], work
+            )
+            flags = judge(
+                readings,
+                at,
+                limits[offset],
+                NOISE_GREY,
+                BENCH.width_px,
+                BENCH.height_px,
+            )
+            if any(flags):
+                raise SystemExit(f"a circle is flagged that nothing disturbs: {flags}")
+            given.append([(r.x_px, r.y_px) for r in readings])
+        return given
+
+    def error(n: int, given: object) -> float:
+        assert isinstance(given, list)
+        truth = [BENCH.centres_px(position_mm((n + part) / len(frames))) for _, part in parts]
+        return float(np.abs(np.array(given) - truth).max()) / MAX_ERROR_PX
+
+    counted = "two fields" if interlaced else "whole frame"
+    return Row(f"smooth centroids and flags, {counted}", measure_all, error)
+
+
 def rows(scene: Scene) -> list[Row]:
     """Return the table's lines; the first is what the others are compared with."""
     whole = scene.whole
@@ -250,6 +312,8 @@ def rows(scene: Scene) -> list[Row]:
         of_centres("OpenCV threshold(OTSU) + moments", whole, lambda i: opencv_moments(i, False)),
         of_centres("OpenCV, moments(binary)", whole, lambda i: opencv_moments(i, True)),
         of_centres("otsu_circle, flags and contrast too", whole, our_otsu),
+        our_smooth("frame", scene),
+        our_smooth("field", scene),
         process_stage("otsu", "frame", scene),
         process_stage("smooth", "frame", scene),
         process_stage("otsu", "field", scene),
