@@ -7,10 +7,34 @@ import math
 import numpy as np
 import pytest
 
-from vdms_rt.measure.rigid import agreeing_motion, position_covariance, rigid_motion
+from vdms_rt.measure import rigid
 
 SQUARE = np.array([(-60.0, 60.0), (60.0, 60.0), (-60.0, -60.0), (60.0, -60.0)])
 ALL = np.ones(4, bool)
+
+
+def spreads(covariances):
+    return [(c[0, 0], c[0, 1], c[1, 1]) for c in covariances]
+
+
+def rigid_motion(reference, now, covariances, good, **more):
+    return rigid.rigid_motion(
+        reference.tolist(), now.tolist(), spreads(covariances), good.tolist(), **more
+    )
+
+
+def agreeing_motion(reference, now, covariances, good, limit):
+    return rigid.agreeing_motion(
+        reference.tolist(), now.tolist(), spreads(covariances), good.tolist(), limit
+    )
+
+
+def matrix(covariance):
+    """Return a covariance of (x, y) or (x, y, rotation) as a matrix."""
+    n = 2 if len(covariance) == 3 else 3
+    full = np.zeros((n, n))
+    full[np.triu_indices(n)] = covariance
+    return full + np.triu(full, 1).T
 
 
 def moved(reference_mm, x_mm, y_mm, rotation_mrad):
@@ -65,7 +89,7 @@ def test_scatter_is_what_the_covariance_says():
         motion = rigid_motion(SQUARE, moved(SQUARE, 3, 0, 10) + noise, covariances, ALL)
         results.append((motion.x_mm - 3, motion.y_mm, motion.rotation_mrad / 1000 - 0.01))
         squares.append(np.square(motion.misfit))
-    assert np.allclose(np.cov(np.array(results).T), motion.covariance, rtol=0.1, atol=2e-9)
+    assert np.allclose(np.cov(np.array(results).T), matrix(motion.covariance), rtol=0.1, atol=2e-9)
     # Chi-square with two degrees of freedom: mean 2, of each circle.
     assert np.allclose(np.mean(squares, axis=0), 2, rtol=0.08)
 
@@ -113,8 +137,8 @@ def test_tolerance_forgives_what_the_lens_bends():
 def test_the_reference_has_its_share():
     rng = np.random.default_rng(11)
     still = rigid_motion(SQUARE, SQUARE, even(0.001), ALL)
-    alone = still.covariance[:2, :2]
-    both = position_covariance(still, SQUARE, even(0.001))
+    alone = matrix(still.covariance)[:2, :2]
+    both = matrix(rigid.position_covariance(still, SQUARE.tolist(), spreads(even(0.001))))
     assert np.allclose(both, 2 * alone)
     errors = []
     for _ in range(2000):

@@ -14,6 +14,9 @@ Matrix: TypeAlias = NDArray[np.float64]
 """Shape (3, 3), float64: homogeneous marker plane (x right, y up, mm) to homogeneous whole-frame
 pixels (x right, y down)."""
 
+Rows: TypeAlias = tuple[tuple[float, ...], ...]
+"""A matrix as tuples of its rows."""
+
 MIN_INDEPENDENCE = 1e-3
 """Least ratio of the eighth to the first singular value of the equations, both planes scaled to
 unit spread along their principal axes. The corners of a parallelogram have 0.36; four points of
@@ -96,6 +99,25 @@ def to_image_px(h: Matrix, points_mm: Points) -> Points:
 def to_marker_mm(h: Matrix, points_px: Points) -> Points:
     """Return where points of the picture lie in the marker plane, (n, 2)."""
     return _apply(inverse(h), points_px)
+
+
+def to_marker(
+    back: Rows, x_px: float, y_px: float
+) -> tuple[tuple[float, float], tuple[float, float, float, float]]:
+    """Return one point of the picture in the marker plane, (x, y) in mm, and d(mm)/d(px) there, row
+    by row: `to_marker_mm` and `jacobian_mm_per_px` in plain floats, for where time counts.
+
+    `back` are the rows of `inverse(h)`.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = back
+    depth = g * x_px + h * y_px + i
+    x, y = (a * x_px + b * y_px + c) / depth, (d * x_px + e * y_px + f) / depth
+    return (x, y), (
+        (a - x * g) / depth,
+        (b - x * h) / depth,
+        (d - y * g) / depth,
+        (e - y * h) / depth,
+    )
 
 
 def jacobian_px_per_mm(h: Matrix, points_mm: Points) -> NDArray[np.float64]:

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from vdms_rt.measure.expect import Expected
 from vdms_rt.measure.gate import Workspace
-from vdms_rt.measure.homography import Matrix, jacobian_mm_per_px, to_marker_mm
+from vdms_rt.measure.homography import Rows, to_marker
 from vdms_rt.measure.radial import edge_fit
-from vdms_rt.measure.rigid import Covariances, Motion, agreeing_motion
+from vdms_rt.measure.rigid import Motion, Point, Spread, agreeing_motion
 from vdms_rt.measure.smooth import CircleReading, Slow, measure
 from vdms_rt.measure.validity import Limits, judge
-from vdms_rt.model import UNUSABLE_CIRCLE, CircleFlag, Luma, Points
+from vdms_rt.model import UNUSABLE_CIRCLE, CircleFlag, Luma
 
 MISFIT_LIMIT = 4.5
 """Standard deviations; with two coordinates a good circle exceeds them once in 25 000 times."""
@@ -94,38 +92,43 @@ class Observation:
     flags: tuple[CircleFlag, ...]
     agree: bool
     """False when the usable circles contradict each other and nobody can say which is wrong."""
-    now_mm: Points
-    """The circles in the marker plane, (n, 2)."""
-    covariance_mm2: Covariances
+    now_mm: tuple[Point, ...]
+    """The circles in the marker plane."""
+    covariance_mm2: tuple[Spread, ...]
 
 
 def motion_of(
     readings: Sequence[CircleReading],
     flags: Sequence[CircleFlag],
-    h: Matrix,
-    reference_mm: Points,
+    back: Rows,
+    reference_mm: Sequence[Point],
     tolerance_mm: float = 0.0,
 ) -> Observation:
     """Return the marker's motion from its usable circles.
 
     Circles that contradict the others get the flag RESIDUAL and are not used. `tolerance_mm` is how
     far a circle may be off for other reasons than noise: what the lens bends between the place at
-    rest and here.
+    rest and here. `back` are the rows of the map from the picture to the marker plane.
     """
-    centres = np.array([(r.x_px, r.y_px) for r in readings])
-    now_mm = to_marker_mm(h, centres)
-    covariance_px2 = np.array(
-        [((xx, xy), (xy, yy)) for xx, xy, yy in (r.covariance_px2 for r in readings)]
-    )
-    jacobian = jacobian_mm_per_px(h, centres)
-    covariance_mm2 = jacobian @ covariance_px2 @ jacobian.transpose(0, 2, 1)
-    good = np.array([not flag & UNUSABLE_CIRCLE for flag in flags])
+    now_mm, covariance_mm2 = [], []
+    for r in readings:
+        xx, xy, yy = r.covariance_px2
+        at, (a, b, c, d) = to_marker(back, r.x_px, r.y_px)
+        now_mm.append(at)
+        covariance_mm2.append(
+            (
+                a * a * xx + 2 * a * b * xy + b * b * yy,
+                a * c * xx + (a * d + b * c) * xy + b * d * yy,
+                c * c * xx + 2 * c * d * xy + d * d * yy,
+            )
+        )
+    good = [not flag & UNUSABLE_CIRCLE for flag in flags]
     motion, agree = agreeing_motion(
         reference_mm, now_mm, covariance_mm2, good, MISFIT_LIMIT, tolerance_mm
     )
     marked = list(flags)
     if motion is not None:
-        for k, (usable, used) in enumerate(zip(good.tolist(), motion.used, strict=True)):
+        for k, (usable, used) in enumerate(zip(good, motion.used, strict=True)):
             if usable and not used:
                 marked[k] |= CircleFlag.RESIDUAL
-    return Observation(motion, tuple(marked), agree, now_mm, covariance_mm2)
+    return Observation(motion, tuple(marked), agree, tuple(now_mm), tuple(covariance_mm2))

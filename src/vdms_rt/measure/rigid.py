@@ -1,20 +1,22 @@
-"""The rigid motion of a marker in its own plane, from as many circles as are good."""
+"""The rigid motion of a marker in its own plane, from as many circles as are good.
+
+Plain floats: of so few circles the arithmetic takes less time than the calls of an array library.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
-
-from vdms_rt.model import Points
 
 LEAST_CIRCLES = 3
 """Two circles fix x, y and rotation, and would hide a wrong one; the third can contradict."""
 
-Covariances = NDArray[np.float64]
-"""One 2 x 2 covariance for each point, (n, 2, 2), float64."""
+Point = tuple[float, float]
+Spread = tuple[float, float, float]
+"""A symmetric 2 x 2 matrix: xx, xy, yy."""
+Symmetric = tuple[float, float, float, float, float, float]
+"""A symmetric 3 x 3 matrix over (x, y, rotation): xx, xy, xr, yy, yr, rr."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +28,8 @@ class Motion:
     rotation_mrad: float
     residual_mm: float
     """Root mean square distance of the circles that were used from the rigid marker."""
-    covariance: NDArray[np.float64]
-    """Of (x mm, y mm, rotation rad), (3, 3), from the errors of the circles of this picture."""
+    covariance: Symmetric
+    """Of (x mm, y mm, rotation rad), from the errors of the circles of this picture."""
     misfit: tuple[float, ...]
     """Of every circle, used or not: its distance from where the *other* used circles say it is, in
     standard deviations of that distance (Baarda 1968); for a good one its square is chi-square
@@ -36,72 +38,88 @@ class Motion:
 
 
 def rigid_motion(
-    reference_mm: Points,
-    now_mm: Points,
-    covariance_mm2: Covariances,
-    good: NDArray[np.bool_],
+    reference_mm: Sequence[Point],
+    now_mm: Sequence[Point],
+    covariance_mm2: Sequence[Spread],
+    good: Sequence[bool],
     tolerance_mm: float = 0.0,
 ) -> Motion | None:
     """Return the rotation about the mean of all `reference_mm` and the shift of that mean which
     best carry the good circles' reference to `now_mm`; None with fewer than three good ones.
 
-    Weighted least squares over the circles' covariances (n, 2, 2). `tolerance_mm` is how far a
-    circle may be off for other reasons than its own noise (what the lens bends); it weakens the
-    misfit, and nothing else.
+    Weighted least squares over the circles' covariances. `tolerance_mm` is how far a circle may be
+    off for other reasons than its own noise (what the lens bends); it weakens the misfit, and
+    nothing else.
     """
-    if np.count_nonzero(good) < LEAST_CIRCLES:
+    if sum(good) < LEAST_CIRCLES:
         return None
-    arms = reference_mm - reference_mm.mean(axis=0)
-    changes = now_mm - reference_mm
-    weights = np.linalg.inv(covariance_mm2[good])
-    angle = _turn(arms[good], now_mm[good])
-    shift = np.zeros(2)
+    arms = _arms(reference_mm)
+    used = [k for k, usable in enumerate(good) if usable]
+    weights = [_inverse(covariance_mm2[k]) for k in used]
+    angle = _turn([arms[k] for k in used], [now_mm[k] for k in used])
+    shift_x = shift_y = 0.0
     for _ in range(4):
-        c, s = math.cos(angle), math.sin(angle)
-        turned = arms @ np.array([[c, s], [-s, c]])
-        residuals = changes + arms - turned - shift
-        slopes = np.zeros((len(arms), 2, 3))
-        slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
-        slopes[:, 0, 2] = -turned[:, 1]
-        slopes[:, 1, 2] = turned[:, 0]
-        weighed = slopes[good].transpose(0, 2, 1) @ weights
-        covariance = np.linalg.inv((weighed @ slopes[good]).sum(axis=0))
-        step = covariance @ (weighed @ residuals[good][:, :, None]).sum(axis=0)[:, 0]
-        shift += step[:2]
-        angle += step[2]
+        cos, sin = math.cos(angle), math.sin(angle)
+        turned = [(cos * x - sin * y, sin * x + cos * y) for x, y in arms]
+        residuals = [
+            (nx - rx + ax - tx - shift_x, ny - ry + ay - ty - shift_y)
+            for (nx, ny), (rx, ry), (ax, ay), (tx, ty) in zip(
+                now_mm, reference_mm, arms, turned, strict=True
+            )
+        ]
+        gradient_x = gradient_y = gradient_r = 0.0
+        for k, (wxx, wxy, wyy) in zip(used, weights, strict=True):
+            (tx, ty), (rx, ry) = turned[k], residuals[k]
+            bx, by = wxx * rx + wxy * ry, wxy * rx + wyy * ry
+            gradient_x += bx
+            gradient_y += by
+            gradient_r += tx * by - ty * bx
+        xx, xy, xr, yy, yr, rr = covariance = _covariance([turned[k] for k in used], weights)
+        step_x = xx * gradient_x + xy * gradient_y + xr * gradient_r
+        step_y = xy * gradient_x + yy * gradient_y + yr * gradient_r
+        step_r = xr * gradient_x + yr * gradient_y + rr * gradient_r
+        shift_x += step_x
+        shift_y += step_y
+        angle += step_r
         # What a step leaves is its square's half of the arms: below a nanometre.
-        if abs(step[2]) < 1e-5:
+        if abs(step_r) < 1e-5:
             break
-    residuals = residuals - slopes @ step
-    # A used circle has pulled the fit towards itself, so its residual is smaller than its error.
-    pull = slopes @ covariance @ slopes.transpose(0, 2, 1)
-    own = covariance_mm2 + np.where(good, -1.0, 1.0)[:, None, None] * pull
-    own = own + tolerance_mm**2 * np.eye(2)
-    misfit = np.sqrt((residuals * np.linalg.solve(own, residuals[:, :, None])[:, :, 0]).sum(axis=1))
+    squares = 0.0
+    misfit = []
+    for usable, (tx, ty), (rx, ry), (cxx, cxy, cyy) in zip(
+        good, turned, residuals, covariance_mm2, strict=True
+    ):
+        rest_x, rest_y = rx - step_x + ty * step_r, ry - step_y - tx * step_r
+        # A used circle has pulled the fit towards itself, so its residual is smaller than its
+        # error.
+        sign = -1.0 if usable else 1.0
+        own = (
+            cxx + sign * (xx - 2 * ty * xr + ty * ty * rr) + tolerance_mm * tolerance_mm,
+            cxy + sign * (xy + tx * xr - ty * yr - tx * ty * rr),
+            cyy + sign * (yy + 2 * tx * yr + tx * tx * rr) + tolerance_mm * tolerance_mm,
+        )
+        wxx, wxy, wyy = _inverse(own)
+        misfit.append(
+            math.sqrt(wxx * rest_x * rest_x + 2 * wxy * rest_x * rest_y + wyy * rest_y * rest_y)
+        )
+        if usable:
+            squares += rest_x * rest_x + rest_y * rest_y
     return Motion(
-        x_mm=float(shift[0]),
-        y_mm=float(shift[1]),
+        x_mm=shift_x,
+        y_mm=shift_y,
         rotation_mrad=1000 * angle,
-        residual_mm=math.sqrt(float((residuals[good] ** 2).sum(axis=1).mean())),
+        residual_mm=math.sqrt(squares / len(used)),
         covariance=covariance,
-        misfit=tuple(misfit.tolist()),
-        used=tuple(good.tolist()),
-    )
-
-
-def _turn(arms_mm: Points, now_mm: Points) -> float:
-    """Return the angle in radians by which unweighed arms have turned."""
-    a, b = arms_mm - arms_mm.mean(axis=0), now_mm - now_mm.mean(axis=0)
-    return math.atan2(
-        float(a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0]), float(a[:, 0] @ b[:, 0] + a[:, 1] @ b[:, 1])
+        misfit=tuple(misfit),
+        used=tuple(good),
     )
 
 
 def agreeing_motion(
-    reference_mm: Points,
-    now_mm: Points,
-    covariance_mm2: Covariances,
-    good: NDArray[np.bool_],
+    reference_mm: Sequence[Point],
+    now_mm: Sequence[Point],
+    covariance_mm2: Sequence[Spread],
+    good: Sequence[bool],
     limit: float,
     tolerance_mm: float = 0.0,
 ) -> tuple[Motion | None, bool]:
@@ -110,35 +128,80 @@ def agreeing_motion(
     While the worst misfit is above `limit`, that circle is left out, as long as three remain. With
     three left that still contradict each other nobody can say which is wrong: the answer is False.
     """
-    good = good.copy()
+    good = list(good)
     while True:
         motion = rigid_motion(reference_mm, now_mm, covariance_mm2, good, tolerance_mm)
         if motion is None:
             return None, True
-        misfit = np.where(good, motion.misfit, 0.0)
-        worst = int(misfit.argmax())
-        if misfit[worst] <= limit:
+        misfit = [m if usable else 0.0 for m, usable in zip(motion.misfit, good, strict=True)]
+        worst = max(misfit)
+        if worst <= limit:
             return motion, True
-        if np.count_nonzero(good) == LEAST_CIRCLES:
+        if sum(good) == LEAST_CIRCLES:
             return motion, False
-        good[worst] = False
+        good[misfit.index(worst)] = False
 
 
 def position_covariance(
-    motion: Motion, reference_mm: Points, reference_covariance_mm2: Covariances
-) -> NDArray[np.float64]:
-    """Return the covariance of (x_mm, y_mm), (2, 2), the reference's own share included.
+    motion: Motion, reference_mm: Sequence[Point], reference_covariance_mm2: Sequence[Spread]
+) -> Spread:
+    """Return the covariance of (x_mm, y_mm), the reference's own share included.
 
-    `reference_covariance_mm2` (n, 2, 2) is that of the circles' reference positions as the current
-    picture sees them: their errors carry over to every later sample just as a picture's own do.
+    `reference_covariance_mm2` is that of the circles' reference positions as the current picture
+    sees them: their errors carry over to every later sample just as a picture's own do.
     """
-    used = np.array(motion.used)
-    arms = (reference_mm - reference_mm.mean(axis=0))[used]
-    slopes = np.zeros((len(arms), 2, 3))
-    slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
-    slopes[:, 0, 2] = -arms[:, 1]
-    slopes[:, 1, 2] = arms[:, 0]
-    weights = np.linalg.inv(reference_covariance_mm2[used])
-    information = (slopes.transpose(0, 2, 1) @ weights @ slopes).sum(axis=0)
-    total: NDArray[np.float64] = (motion.covariance + np.linalg.inv(information))[:2, :2]
-    return total
+    arms = _arms(reference_mm)
+    used = [k for k, usable in enumerate(motion.used) if usable]
+    weights = [_inverse(reference_covariance_mm2[k]) for k in used]
+    own_xx, own_xy, _, own_yy, _, _ = motion.covariance
+    xx, xy, _, yy, _, _ = _covariance([arms[k] for k in used], weights)
+    return own_xx + xx, own_xy + xy, own_yy + yy
+
+
+def _arms(reference_mm: Sequence[Point]) -> list[Point]:
+    n = len(reference_mm)
+    mean_x = sum(x for x, _ in reference_mm) / n
+    mean_y = sum(y for _, y in reference_mm) / n
+    return [(x - mean_x, y - mean_y) for x, y in reference_mm]
+
+
+def _turn(arms_mm: Sequence[Point], now_mm: Sequence[Point]) -> float:
+    """Return the angle in radians by which unweighed arms have turned."""
+    n = len(arms_mm)
+    arm_x, arm_y = sum(x for x, _ in arms_mm) / n, sum(y for _, y in arms_mm) / n
+    cross = dot = 0.0
+    # The mean of only one of the two has to be taken off.
+    for (ax, ay), (nx, ny) in zip(arms_mm, now_mm, strict=True):
+        own_x, own_y = ax - arm_x, ay - arm_y
+        cross += own_x * ny - own_y * nx
+        dot += own_x * nx + own_y * ny
+    return math.atan2(cross, dot)
+
+
+def _covariance(arms_mm: Sequence[Point], weights: Sequence[Spread]) -> Symmetric:
+    """Return the covariance of (x, y, rotation) for circles on these arms with these weights."""
+    nxx = nxy = nxr = nyy = nyr = nrr = 0.0
+    for (ax, ay), (wxx, wxy, wyy) in zip(arms_mm, weights, strict=True):
+        turn_x, turn_y = wxy * ax - wxx * ay, wyy * ax - wxy * ay
+        nxx += wxx
+        nxy += wxy
+        nyy += wyy
+        nxr += turn_x
+        nyr += turn_y
+        nrr += ax * turn_y - ay * turn_x
+    cxx, cxy, cxr = nyy * nrr - nyr * nyr, nxr * nyr - nxy * nrr, nxy * nyr - nxr * nyy
+    det = nxx * cxx + nxy * cxy + nxr * cxr
+    return (
+        cxx / det,
+        cxy / det,
+        cxr / det,
+        (nxx * nrr - nxr * nxr) / det,
+        (nxy * nxr - nxx * nyr) / det,
+        (nxx * nyy - nxy * nxy) / det,
+    )
+
+
+def _inverse(spread: Spread) -> Spread:
+    xx, xy, yy = spread
+    det = xx * yy - xy * xy
+    return yy / det, -xy / det, xx / det

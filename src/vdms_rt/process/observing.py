@@ -15,7 +15,7 @@ from vdms_rt.measure.homography import jacobian_mm_per_px, to_image_px
 from vdms_rt.measure.lens import Lens, undistort_px
 from vdms_rt.measure.motion import mean_displacement, mean_rotation_mrad
 from vdms_rt.measure.observe import motion_of, observe
-from vdms_rt.measure.rigid import position_covariance
+from vdms_rt.measure.rigid import Spread, position_covariance
 from vdms_rt.measure.smooth import CircleReading
 from vdms_rt.measure.validity import Limits
 from vdms_rt.model import UNUSABLE_CIRCLE, Circle, CircleFlag, MarkerShape, Picture, Status
@@ -38,14 +38,14 @@ class Seen:
     circles: tuple[Circle, ...]
     pose: Pose | None
     """None where there are too few good circles."""
-    covariance_mm2: tuple[tuple[float, float], tuple[float, float]]
+    covariance_mm2: Spread
     """Of x and y; NaN with method otsu."""
     residual_mm: float
     velocity: Pose
     status: Status
 
 
-UNKNOWN = ((math.nan, math.nan), (math.nan, math.nan))
+UNKNOWN = (math.nan, math.nan, math.nan)
 
 
 def look(
@@ -76,7 +76,7 @@ def _paper(shape: MarkerShape, watch: Watch, view: View, picture: Picture) -> tu
         return Seen(circles, None, UNKNOWN, math.nan, REST, Status.NOT_FOUND), watch
     seen_px = np.array([(circles[n].x_px, circles[n].y_px) for n in good])
     centres = undistort_px(watch.lens, seen_px)
-    zero_mm = view.zero_mm[good]
+    zero_mm = np.array(view.zero_mm)[good]
     x_mm, y_mm, residual_mm = mean_displacement(watch.ideal, centres, zero_mm)
     rotation_mrad = mean_rotation_mrad(watch.ideal, centres, zero_mm)
     status = Status.FEWER_CIRCLES if len(good) < len(circles) else Status.OK
@@ -106,7 +106,7 @@ def _smooth(
     )
     tolerance_mm = BENT_PX * view.mm_per_px + BENT_MM_PER_MM * math.hypot(pose[0], pose[1])
     observation = motion_of(
-        _undistorted(watch.lens, readings), flags, watch.ideal, view.zero_mm, tolerance_mm
+        _undistorted(watch.lens, readings), flags, watch.back, view.zero_mm, tolerance_mm
     )
     circles = tuple(circle_of(r, f) for r, f in zip(readings, observation.flags, strict=True))
     motion = observation.motion
@@ -129,8 +129,7 @@ def _smooth(
         status |= Status.RELOCATED
     now: Pose = (motion.x_mm, motion.y_mm, motion.rotation_mrad)
     covariance = position_covariance(motion, view.zero_mm, view.covariance_mm2)
-    (xx, xy), (_, yy) = covariance.tolist()
-    seen = Seen(circles, now, ((xx, xy), (xy, yy)), motion.residual_mm, velocity, status)
+    seen = Seen(circles, now, covariance, motion.residual_mm, velocity, status)
     track = watch.track.with_pose(picture.t_ns, now) if observation.agree else watch.track
     after = dataclasses.replace(
         watch,
@@ -163,9 +162,10 @@ def _undistorted(lens: Lens | None, readings: list[CircleReading]) -> list[Circl
 def relocated(watch: Watch, centres_px: tuple[tuple[float, float], ...], t_ns: int) -> Watch:
     """Return a lost marker's watch after a search has found its circles again."""
     (view, *_) = watch.views.values()
+    zero_mm = np.array(view.zero_mm)
     centres = undistort_px(watch.lens, np.array(centres_px))
-    x_mm, y_mm, _ = mean_displacement(watch.ideal, centres, view.zero_mm)
-    turn = mean_rotation_mrad(watch.ideal, centres, view.zero_mm)
+    x_mm, y_mm, _ = mean_displacement(watch.ideal, centres, zero_mm)
+    turn = mean_rotation_mrad(watch.ideal, centres, zero_mm)
     return dataclasses.replace(
         watch,
         track=Track(((t_ns, (x_mm, y_mm, turn)),)),
@@ -177,14 +177,15 @@ def relocated(watch: Watch, centres_px: tuple[tuple[float, float], ...], t_ns: i
 def shake_px(watch: Watch, pose: Pose) -> tuple[float, float]:
     """Return how far a fixed marker's middle has moved in the picture: the camera's shake."""
     (view, *_) = watch.views.values()
-    middle = view.zero_mm.mean(axis=0)
-    there = to_image_px(watch.homography, np.array([middle, middle + pose[:2]]))
+    x, y = view.middle_mm
+    there = to_image_px(watch.homography, np.array([(x, y), (x + pose[0], y + pose[1])]))
     return float(there[1, 0] - there[0, 0]), float(there[1, 1] - there[0, 1])
 
 
 def mm_per_px(watch: Watch, pose: Pose) -> list[list[float]]:
     """Return d(mm)/d(px), 2 x 2, at the middle of a marker at a pose."""
     (view, *_) = watch.views.values()
-    at_px = to_image_px(watch.homography, view.zero_mm.mean(axis=0)[None] + np.array(pose[:2]))
+    x, y = view.middle_mm
+    at_px = to_image_px(watch.homography, np.array([(x + pose[0], y + pose[1])]))
     jacobian: list[list[float]] = jacobian_mm_per_px(watch.homography, at_px)[0].tolist()
     return jacobian

@@ -16,13 +16,15 @@ from vdms_rt.measure.fieldorder import OrderEvidence
 from vdms_rt.measure.gate import Shape
 from vdms_rt.measure.homography import (
     Matrix,
+    Rows,
     homography,
+    inverse,
     reference_covariance_mm2,
     scale_px_per_mm,
     to_marker_mm,
 )
 from vdms_rt.measure.lens import Lens, lens_for, undistort_px
-from vdms_rt.measure.rigid import Covariances
+from vdms_rt.measure.rigid import Point, Spread
 from vdms_rt.measure.smooth import CircleReading, Slow
 from vdms_rt.measure.validity import Limits
 from vdms_rt.model import Circle, MarkerShape, Points, Region, Scan, State
@@ -72,9 +74,11 @@ class Plan:
 class View:
     """One marker's reference in one kind of picture, in the form that every picture needs."""
 
-    zero_mm: Points
+    zero_mm: tuple[Point, ...]
     """The circles at rest, by the homography."""
-    covariance_mm2: Covariances
+    middle_mm: Point
+    """Their mean."""
+    covariance_mm2: tuple[Spread, ...]
     """Of the circles' displacement, from the errors of the reference alone."""
     mm_per_px: float
     forecast: Forecast | None
@@ -89,6 +93,8 @@ class Watch:
     """To pixels as the lens shows them: tells where circles are seen."""
     ideal: Matrix
     """To pixels as a lens that bends nothing would show them: tells millimetres."""
+    back: Rows
+    """The rows of the inverse of `ideal`."""
     lens: Lens | None
     views: dict[Scan, View]
     slow: dict[Scan, Slow]
@@ -198,9 +204,13 @@ def _watch(
         if field_.appearance is not None:
             whole = field_.kind is Scan.PROGRESSIVE
             forecast = Forecast(field_.appearance, h, woven_s if whole else exposure_s)
+        zero_mm = to_marker_mm(ideal, at_px)
+        spreads = reference_covariance_mm2(circles_mm, reference_px, variance, at_px).tolist()
+        middle_x, middle_y = zero_mm.mean(axis=0).tolist()
         views[field_.kind] = View(
-            zero_mm=to_marker_mm(ideal, at_px),
-            covariance_mm2=reference_covariance_mm2(circles_mm, reference_px, variance, at_px),
+            zero_mm=tuple((x, y) for x, y in zero_mm.tolist()),
+            middle_mm=(middle_x, middle_y),
+            covariance_mm2=tuple((xx, xy, yy) for (xx, xy), (_, yy) in spreads),
             mm_per_px=1 / max(scale_px_per_mm(h)),
             forecast=forecast,
             limits=field_.limits,
@@ -208,6 +218,7 @@ def _watch(
     return Watch(
         homography=h,
         ideal=ideal,
+        back=tuple(map(tuple, inverse(ideal).tolist())),
         lens=lens,
         views=views,
         slow={

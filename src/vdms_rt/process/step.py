@@ -178,7 +178,7 @@ def _sample(
     if seen.pose is None:
         return blank
     x_mm, y_mm, rotation_mrad = seen.pose
-    (xx, xy), (_, yy) = seen.covariance_mm2
+    xx, xy, yy = seen.covariance_mm2
     if shake is not None:
         (shift_x, shift_y), fixed = shake
         if fixed.pose is None:
@@ -186,7 +186,7 @@ def _sample(
         (a, b), (c, d) = mm_per_px(progress.watches[n], seen.pose)
         x_mm -= a * shift_x + b * shift_y
         y_mm -= c * shift_x + d * shift_y
-        (fxx, fxy), (_, fyy) = fixed.covariance_mm2
+        fxx, fxy, fyy = fixed.covariance_mm2
         xx, xy, yy = xx + fxx, xy + fxy, yy + fyy
     # The position's error from the time's: v sigma_t.
     time_s = picture.sigma_t_ns / 1e9
@@ -221,7 +221,7 @@ def _ordered(
     ]
     if not moving or moving[0] is None:
         return progress, ()
-    sigma_mm = math.sqrt(max(sights[0].covariance_mm2[0][0], 0.0))
+    sigma_mm = math.sqrt(max(sights[0].covariance_mm2[0], 0.0))
     evidence = with_field(
         progress.evidence,
         picture.frame_seq,
