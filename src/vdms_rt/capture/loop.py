@@ -50,6 +50,9 @@ class CaptureCounters:
     """Why a source that is not live gave up; one sentence."""
     missed: int = 0
     clock: ClockFigures | None = None
+    turns: int = 0
+    """Goes up at least every two seconds while the thread is well, frames or none: what hangs in
+    a driver's call stands still, whatever the state says."""
 
 
 class Capture:
@@ -83,6 +86,7 @@ class Capture:
         capture thread. A device that fails is opened again for ever."""
         try:
             while not stop.is_set() and not self.counters.ended:
+                self.counters.turns += 1
                 source = self._open(stop)
                 if source is not None:
                     try:
@@ -123,6 +127,7 @@ class Capture:
     def _fill(self, source: Source, stop: threading.Event) -> None:
         silent_s = 0.0
         while not stop.is_set():
+            self.counters.turns += 1
             try:
                 slot = self._ring.begin(READ_TIMEOUT_S)
             except RingClosed:
