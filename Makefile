@@ -30,10 +30,16 @@ $(VENV)/dev.stamp: requirements/dev.txt $(VENV)/run.stamp
 	@$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements/dev.txt
 	@touch $@
 
+$(VENV)/replay.stamp: requirements/replay.txt tools/replay/pyproject.toml $(VENV)/dev.stamp
+	@echo "installing vdms-replay"
+	@$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements/replay.txt
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable tools/replay
+	@touch $@
+
 demo: $(VENV)/run.stamp ## measure the virtual shaking table (SECONDS=10 ends by itself)
 	@$(BIN)/vdms-rt run --config config/demo.toml --seconds $(SECONDS)
 
-check: $(VENV)/dev.stamp ## format, lint, types, layers
+check: $(VENV)/replay.stamp ## format, lint, types, layers
 	@$(BIN)/ruff format --check --quiet . || { $(BIN)/ruff format --diff --quiet .; exit 1; }
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/mypy --no-error-summary
@@ -43,7 +49,7 @@ check: $(VENV)/dev.stamp ## format, lint, types, layers
 test: check ## everything that runs without a kernel of its own
 	@$(BIN)/pytest -m "not rig"
 
-quick: $(VENV)/dev.stamp ## the fast tests alone
+quick: $(VENV)/replay.stamp ## the fast tests alone
 	@$(BIN)/pytest -q -m "not rig and not slow"
 
 rig: $(VENV)/dev.stamp ## the tests on real kernel drivers, in a virtual machine
@@ -53,7 +59,8 @@ lock: $(VENV)/dev.stamp ## write requirements/*.txt anew
 	@$(BIN)/pip install --quiet uv
 	@cd requirements && for f in run dev; do \
 	  extra=; [ $$f = run ] || extra=dev.in; \
-	  ../$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header ../pyproject.toml build.in $$extra -o $$f.txt; done
+	  ../$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header ../pyproject.toml build.in $$extra -o $$f.txt; done; \
+	  ../$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-emit-package vdms-rt --constraint dev.txt --all-extras ../tools/replay/pyproject.toml build.in -o replay.txt
 
 proto: $(VENV)/dev.stamp ## compile wire/vdms.proto
 	@PATH=$(BIN):$$PATH $(BIN)/python -m grpc_tools.protoc -I src --python_out=src --mypy_out=src src/vdms_rt/wire/vdms.proto

@@ -1,0 +1,306 @@
+"""Recordings as pandas tables, in one call."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, cast
+
+import pandas as pd
+from mcap.records import Attachment, Metadata
+
+from vdms_replay.columns import MEANINGS, UNITS, Clock, Samples, Truths
+from vdms_replay.source import SAMPLE, Damage, Entry, PathLike, ReplayError, Source
+from vdms_rt.setup import SetUp, set_up_from_json
+from vdms_rt.wire import vdms_pb2 as pb
+
+ROWS_AT_ONCE = 65536
+PIXELS = "vdms.Pixels"
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedSetUp:
+    """One set-up of a recording, as it was said."""
+
+    session: str
+    revision: int
+    utc_ns: int
+    report: str
+    """A page for a person."""
+    json: str
+
+    def set_up(self) -> SetUp:
+        """Return its values. Raises SetUpError if it is of another version."""
+        return set_up_from_json(self.json)
+
+
+@dataclass(slots=True)
+class About:
+    """What a recording says about itself, its samples aside."""
+
+    station: str = ""
+    runs: dict[str, pb.Run] = field(default_factory=dict)
+    """The newest head of each session."""
+    set_ups: dict[tuple[str, int], RecordedSetUp] = field(default_factory=dict)
+    """By session and revision."""
+    events: list[pb.Event] = field(default_factory=list)
+    ends: list[pb.End] = field(default_factory=list)
+    """One for each file that was ended."""
+    repairs: list[str] = field(default_factory=list)
+    """What repairs have left out of the files."""
+    attachments: dict[str, bytes] = field(default_factory=dict)
+
+    def take(self, item: Entry | Attachment | Metadata) -> None:
+        """Keep what `item` says. Raises ReplayError for a second station."""
+        match item:
+            case Attachment():
+                self.attachments[item.name] = item.data
+            case Metadata():
+                if item.name == "repair":
+                    self.repairs.append(_repair(item.metadata))
+            case Entry():
+                self._entry(item)
+
+    def _entry(self, entry: Entry) -> None:
+        station = entry.key.split("/")[1] if entry.key.count("/") > 1 else ""
+        self.station = self.station or station
+        if station and station != self.station:
+            raise ReplayError(
+                f"the files are of the stations {self.station} and {station}; "
+                "name those of one station"
+            )
+        match entry.value:
+            case pb.Run() as run:
+                self.runs[f"{run.session:016x}"] = run
+            case pb.SetUp() as said:
+                session = f"{said.session:016x}"
+                self.set_ups[session, said.revision] = RecordedSetUp(
+                    session, said.revision, said.utc_ns, said.report, said.json
+                )
+            case pb.Event() as event:
+                self.events.append(event)
+            case pb.End() as end:
+                self.ends.append(end)
+
+    @property
+    def run(self) -> pb.Run:
+        """The first session's head; an empty one where none was readable."""
+        return next(iter(self.runs.values()), pb.Run())
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Every value in force, as the first session recorded it."""
+        text = self.run.effective_config
+        return cast("dict[str, Any]", json.loads(text)) if text else {}
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """All of a recording but its pixels; one station, one or several files."""
+
+    paths: tuple[Path, ...]
+    """In the order of time."""
+    about: About
+    samples: pd.DataFrame
+    """A row for each sample of each marker, in the order of time; see `load`."""
+    truth: pd.DataFrame
+    """Where a virtual table's sheet really was: `time_s` (same zero), `marker`, `x_mm`, `y_mm`,
+    `rotation_mrad`, `mean_x_mm`, `mean_y_mm` (over the exposure), `frame`, `scan`, `t_ns`,
+    `stamp_ns`. Joins the samples by `(marker, stamp_ns, scan)`. Empty of a real camera."""
+    health: pd.DataFrame
+    """A row a second: the fields of `vdms.Health`, and `utc`."""
+    damage: tuple[Damage, ...]
+    """What of each file could not be read."""
+    doubled: int
+    """Samples that stood in the files twice, and are given once."""
+
+    @property
+    def markers(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(self.samples["marker"]))
+
+    def of_marker(self, marker: str | None = None) -> pd.DataFrame:
+        """Return the samples of one marker; for None of the only one that is not fixed.
+
+        Raises ReplayError if there is no such marker, or more than one.
+        """
+        name = choose_marker(self.about, self.markers, marker)
+        return self.samples[self.samples["marker"] == name].reset_index(drop=True)
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        """Set-up and circumstances as plain values that JSON can hold: what `load` puts into
+        `attrs`."""
+        return metadata(self.about, self.paths, self.damage)
+
+
+def load(
+    *files: PathLike,
+    marker: str | None = None,
+    valid_only: bool = False,
+    circles: bool = False,
+) -> pd.DataFrame:
+    """Return the displacements of a recording as a table, a row for each sample.
+
+    Several files are the parts of one station's recording, in any order. Columns, units in their
+    names: `time_s` (middle of the exposure, seconds since the first sample), `utc` (the same as
+    time stamp, NaT where unknown), `marker`, `x_mm`, `y_mm`, `rotation_mrad`, `sigma_x_mm`,
+    `sigma_y_mm`, `residual_mm`, `valid`, `status` (bits), `status_text`, `seq`, `frame_seq`,
+    `scan`, `segment`, `setup_revision`, `session`, `t_ns`, `sigma_t_ns`, `utc_ns`, `stamp_ns`;
+    with `circles` also `circle1_x_px`, `_y_px`, `_area_px`, `_contrast`, `_flags` and so on. All
+    markers, or only `marker`; all samples, or with `valid_only` those that are measurements.
+    Attributes (`.attrs`) hold what the recording says about itself.
+
+    Raises ReplayError with a sentence.
+    """
+    recording = read(*files, circles=circles)
+    table = recording.samples
+    if marker is not None:
+        table = recording.of_marker(marker)
+    if valid_only:
+        table = table[table["valid"]].reset_index(drop=True)
+    table.attrs.update(recording.meta)
+    return table
+
+
+def read(
+    *files: PathLike, circles: bool = False, advance: Callable[[int], None] | None = None
+) -> Recording:
+    """Return all of a recording but its pixels.
+
+    `files` and `circles` are as for `load`; `advance` is told the bytes read since its last call.
+    Raises ReplayError with a sentence.
+    """
+    source = Source(files)
+    about, clock = About(), Clock()
+    samples, truths = Samples(clock, circles=circles), Truths(clock)
+    sample_parts, truth_parts = [], []
+    health: list[pb.Health] = []
+    once = Once()
+    session = 0
+    for item in source.items(NOT_PIXELS, advance):
+        about.take(item)
+        if not isinstance(item, Entry):
+            continue
+        match item.value:
+            case pb.Displacement() as sample:
+                if once.is_new(sample):
+                    samples.add(sample)
+                    if len(samples) >= ROWS_AT_ONCE:
+                        sample_parts.append(samples.take())
+            case pb.Truth() as truth:
+                truths.add(truth, session)
+                if len(truths) >= ROWS_AT_ONCE:
+                    truth_parts.append(truths.take())
+            case pb.Health() as one:
+                health.append(one)
+            case pb.Run() as run:
+                session = run.session
+    sample_parts.append(samples.take())
+    truth_parts.append(truths.take())
+    return Recording(
+        paths=tuple(source.paths),
+        about=about,
+        samples=pd.concat(sample_parts, ignore_index=True),
+        truth=pd.concat(truth_parts, ignore_index=True),
+        health=_health_table(health),
+        damage=tuple(source.damage.values()),
+        doubled=once.doubled,
+    )
+
+
+NOT_PIXELS = (
+    SAMPLE, "vdms.Truth", "vdms.Health", "vdms.Event", "vdms.SetUp", "vdms.Run", "vdms.End",
+)  # fmt: skip
+"""The types that tell of a recording, pixels aside."""
+
+
+class Once:
+    """Tells samples that were there before: two files overlap where a disk gave trouble."""
+
+    def __init__(self) -> None:
+        self._newest: dict[tuple[int, str], int] = {}
+        self.doubled = 0
+
+    def is_new(self, sample: pb.Displacement) -> bool:
+        of = sample.session, sample.marker
+        if sample.seq <= self._newest.get(of, -1):
+            self.doubled += 1
+            return False
+        self._newest[of] = sample.seq
+        return True
+
+
+def choose_marker(about: About, markers: Sequence[str], asked: str | None) -> str:
+    """Return the marker that was asked for; for None the only one that is not fixed.
+
+    Raises ReplayError if there is none, or more than one.
+    """
+    if not markers:
+        raise ReplayError("the recording holds no displacement")
+    if asked is not None:
+        if asked in markers:
+            return asked
+        raise ReplayError(f"the recording has no marker {asked}; it has {', '.join(markers)}")
+    fixed = {m["name"] for m in about.config.get("marker", []) if m.get("fixed")}
+    moving = [marker for marker in markers if marker not in fixed] or list(markers)
+    if len(moving) > 1:
+        raise ReplayError(
+            f"the recording has the markers {', '.join(moving)}; choose one with --marker"
+        )
+    return moving[0]
+
+
+def metadata(about: About, paths: Sequence[Path], damage: Sequence[Damage]) -> dict[str, Any]:
+    """Return what a recording says about itself as plain values that JSON can hold."""
+    run = about.run
+    return {
+        "station": about.station,
+        "sessions": list(about.runs),
+        "files": [path.name for path in paths],
+        "recorded_by": f"vdms-rt {run.version}" if run.version else "",
+        "recorded_at": iso(run.utc_ns),
+        "device": {fact.name: fact.value for fact in run.facts},
+        "set_ups": [
+            {"session": s.session, "revision": s.revision, "utc": iso(s.utc_ns), "report": s.report}
+            for s in about.set_ups.values()
+        ],
+        "set_up_json": [s.json for s in about.set_ups.values()],
+        "config_text": run.config_text,
+        "config_json": run.effective_config,
+        "ends": [end.reason for end in about.ends],
+        "not_readable": [sentence for one in damage for sentence in one.sentences()],
+        "repairs": list(about.repairs),
+        "units": dict(UNITS),
+        "meanings": dict(MEANINGS),
+    }
+
+
+def iso(utc_ns: int) -> str:
+    """Return a UTC time with its nanoseconds as ISO 8601, or nothing for 0."""
+    if not utc_ns:
+        return ""
+    seconds, rest_ns = divmod(utc_ns, 1_000_000_000)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns:09}Z"
+
+
+HEALTH_FIELDS = [field.name for field in pb.Health.DESCRIPTOR.fields]
+
+
+def _health_table(messages: list[pb.Health]) -> pd.DataFrame:
+    table = pd.DataFrame(
+        [[getattr(message, name) for name in HEALTH_FIELDS] for message in messages],
+        columns=HEALTH_FIELDS,
+    )
+    table.insert(0, "utc", pd.to_datetime(table["utc_ns"].astype("int64"), utc=True))
+    return table
+
+
+def _repair(values: dict[str, str]) -> str:
+    dropped = values.get("dropped_bytes", "?")
+    faults = values.get("faults", "")
+    return f"repaired: {dropped} unreadable bytes were left out" + (
+        f" ({faults})" if faults else ""
+    )
