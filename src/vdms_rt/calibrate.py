@@ -31,7 +31,9 @@ LARGEST_STRAYING = 0.01
 """Of a stroke from its axis, as a part of its length."""
 UNSEEN = CircleFlag.LOST | CircleFlag.BORDER | CircleFlag.CONTRAST
 """Flags of a circle that says nothing of the lens. The others may be the lens's own doing."""
-NO_POSITION = Status.SET_UP | Status.DAMAGED | Status.SET_UP_STALE
+NO_POSITION = (
+    Status.SET_UP | Status.DAMAGED | Status.REPEATED | Status.NO_SIGNAL | Status.SET_UP_STALE
+)
 
 
 class CalibrateError(VdmsError):

@@ -248,7 +248,7 @@ class Daemon:
         if len(self._rates) > 1:
             (then_s, then), (now_s, now) = self._rates[0], self._rates[-1]
             rate_hz = (now - then) / (now_s - then_s)
-        state = capture.state if capture.state is not State.MEASURING else process.state
+        state = capture.state if capture.state is not State.STREAMING else process.state
         return Health(
             session=self._outlet.session,
             utc_ns=time.time_ns(),
@@ -258,6 +258,8 @@ class Daemon:
             captured=capture.captured,
             missed=capture.missed,
             damaged=capture.damaged,
+            repeated=capture.repeated,
+            no_signal=capture.no_signal,
             overwritten=self._ring.overwritten,
             measured=process.measured,
             invalid=process.invalid,

@@ -61,11 +61,15 @@ class Scan(IntEnum):
 
 
 class Damage(IntFlag):
-    """What a driver says is wrong with a buffer. Such a picture is never measured as if whole."""
+    """What is wrong with an image. Such a picture is never measured as if whole."""
 
     NONE = 0
     FLAGGED = 1
     SHORT = 2
+    REPEATED = 4
+    """The picture before, delivered once more."""
+    NO_SIGNAL = 8
+    """What a grabber shows without a camera: blank, noise, a test card."""
 
 
 class StampEvent(StrEnum):
@@ -99,6 +103,8 @@ class SourceInfo:
     """Where the source knows its own exposure; otherwise `camera.exposure_ms` holds."""
     facts: tuple[tuple[str, str], ...] = ()
     """Names and values for the log and the person: driver, card, bus, input, standard, format."""
+    warnings: tuple[str, ...] = ()
+    """Sentences on what a person should know of it before trusting its pictures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,6 +239,10 @@ class Status(IntFlag):
     """Part of a circle is as bright as the picture can be; valid, with more error."""
     FIXED_LOST = 2048
     """The fixed marker was not seen, so the camera's shake could not be taken off."""
+    REPEATED = 4096
+    """The driver delivered the picture before once more, which is of another time."""
+    NO_SIGNAL = 8192
+    """The grabber has no camera's signal."""
 
 
 INVALID_STATUS = (
@@ -243,8 +253,22 @@ INVALID_STATUS = (
     | Status.SET_UP_STALE
     | Status.FIELD_ORDER_WRONG
     | Status.FIXED_LOST
+    | Status.REPEATED
+    | Status.NO_SIGNAL
 )
 """A sample with any of these is not a measurement."""
+
+
+def damage_status(damage: Damage) -> Status:
+    """Return what a picture's damage makes of its samples."""
+    status = Status.OK
+    if damage & (Damage.FLAGGED | Damage.SHORT):
+        status |= Status.DAMAGED
+    if damage & Damage.REPEATED:
+        status |= Status.REPEATED
+    if damage & Damage.NO_SIGNAL:
+        status |= Status.NO_SIGNAL
+    return status
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,6 +340,8 @@ class State(StrEnum):
     STARTING = "starting"
     NO_DEVICE = "no device"
     NO_SIGNAL = "no signal"
+    STREAMING = "streaming"
+    """Of the capture stage alone: what is made of the frames, the process stage says."""
     SEARCHING = "looking for the marker"
     WAITING_FOR_STILL = "waiting for still"
     REFERENCE = "taking the reference"
@@ -389,6 +415,10 @@ class Health:
     """Of the source's frame clock against the computer's, positive when frames come fast."""
     utc_state: str
     """`synchronised`, `not synchronised` or `unknown`, of the computer's UTC clock."""
+    repeated: int = 0
+    """Frames that were the one before, delivered once more."""
+    no_signal: int = 0
+    """Frames in which the grabber showed no camera's picture."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,8 @@ STATUS_WORDS = {
     Status.RELOCATED: "found again",
     Status.SATURATED: "too bright",
     Status.FIXED_LOST: "fixed marker not found",
+    Status.REPEATED: "repeated frame",
+    Status.NO_SIGNAL: "no signal",
 }
 
 
@@ -50,6 +52,8 @@ def summary(health: Health, files: Sequence[str]) -> str:
         ("captured", f"{health.captured} frames"),
         ("missed", f"{health.missed} frames lost before the computer had them"),
         ("damaged", f"{health.damaged} frames that the driver delivered broken"),
+        ("repeated", f"{health.repeated} frames that the driver delivered twice"),
+        ("no signal", f"{health.no_signal} frames without a camera's picture"),
         ("overwritten", f"{health.overwritten} frames that came faster than they were measured"),
         ("measured", f"{health.measured} samples"),
         ("invalid", f"{health.invalid} samples after the reference without a position"),

@@ -44,6 +44,9 @@ class CaptureCounters:
     info: SourceInfo | None = None
     captured: int = 0
     damaged: int = 0
+    """Short or flagged by the driver."""
+    repeated: int = 0
+    no_signal: int = 0
     ended: bool = False
     """The source is not live and has given its last frame, or could not be opened."""
     failure: str = ""
@@ -162,7 +165,7 @@ class Capture:
             self.counters.captured += 1
             if grab.damage is not Damage.NONE:
                 self.counters.damaged += 1
-            self._tell(State.MEASURING, Severity.INFO, f"frames come from {source.info.name}")
+            self._tell(State.STREAMING, Severity.INFO, f"frames come from {source.info.name}")
             tick = grab.tick or self._tick(grab)
             self._ring.commit(
                 slot,

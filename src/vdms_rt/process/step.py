@@ -21,6 +21,7 @@ from vdms_rt.model import (
     Scan,
     Severity,
     Status,
+    damage_status,
 )
 from vdms_rt.process.observing import Seen, look, mm_per_px, relocated, shake_px
 from vdms_rt.process.progress import Phase, Plan, Progress, lost_long, watches_of
@@ -123,7 +124,7 @@ def step(progress: Progress, picture: Picture, work: Workspace) -> Step:
     Pure: the same progress and picture give the same values, bit for bit; `work` is scratch.
     """
     if picture.damage:
-        status = Status.DAMAGED | _standing(progress, picture)
+        status = damage_status(picture.damage) | _standing(progress, picture)
         return progress, _blank(progress, picture, status), ()
     if progress.phase is Phase.SEARCHING:
         return progress, _blank(progress, picture, Status.SET_UP), ()

@@ -180,6 +180,8 @@ def health_message(h: Health) -> pb.Health:
         clock_sigma_us=h.clock_sigma_us,
         clock_rate_ppm=h.clock_rate_ppm,
         utc_state=h.utc_state,
+        repeated=h.repeated,
+        no_signal=h.no_signal,
     )
 
 

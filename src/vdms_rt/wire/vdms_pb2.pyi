@@ -62,6 +62,8 @@ class _StatusEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Status.ValueTy
     RELOCATED: _Status.ValueType  # 512
     SATURATED: _Status.ValueType  # 1024
     FIXED_LOST: _Status.ValueType  # 2048
+    REPEATED: _Status.ValueType  # 4096
+    NO_SIGNAL: _Status.ValueType  # 8192
 
 class Status(_Status, metaclass=_StatusEnumTypeWrapper):
     """Bits of Displacement.status; 0 is a good sample."""
@@ -79,6 +81,8 @@ CLOCK_SETTLING: Status.ValueType  # 256
 RELOCATED: Status.ValueType  # 512
 SATURATED: Status.ValueType  # 1024
 FIXED_LOST: Status.ValueType  # 2048
+REPEATED: Status.ValueType  # 4096
+NO_SIGNAL: Status.ValueType  # 8192
 Global___Status: _TypeAlias = Status  # noqa: Y015
 
 class _CircleFlag:
@@ -313,6 +317,8 @@ class Health(_message.Message):
     CLOCK_SIGMA_US_FIELD_NUMBER: _builtins.int
     CLOCK_RATE_PPM_FIELD_NUMBER: _builtins.int
     UTC_STATE_FIELD_NUMBER: _builtins.int
+    REPEATED_FIELD_NUMBER: _builtins.int
+    NO_SIGNAL_FIELD_NUMBER: _builtins.int
     session: _builtins.int
     utc_ns: _builtins.int
     uptime_s: _builtins.float
@@ -338,6 +344,8 @@ class Health(_message.Message):
     clock_sigma_us: _builtins.float
     clock_rate_ppm: _builtins.float
     utc_state: _builtins.str
+    repeated: _builtins.int
+    no_signal: _builtins.int
     def __init__(
         self,
         *,
@@ -366,10 +374,12 @@ class Health(_message.Message):
         clock_sigma_us: _builtins.float = ...,
         clock_rate_ppm: _builtins.float = ...,
         utc_state: _builtins.str = ...,
+        repeated: _builtins.int = ...,
+        no_signal: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["captured", b"captured", "clock_jitter_us", b"clock_jitter_us", "clock_rate_ppm", b"clock_rate_ppm", "clock_sigma_us", b"clock_sigma_us", "damaged", b"damaged", "device", b"device", "disk_free_bytes", b"disk_free_bytes", "frame_rate_hz", b"frame_rate_hz", "fsync_ms", b"fsync_ms", "invalid", b"invalid", "measured", b"measured", "missed", b"missed", "not_recorded", b"not_recorded", "overwritten", b"overwritten", "record_queue", b"record_queue", "record_trouble", b"record_trouble", "recording", b"recording", "ring_used", b"ring_used", "sample_age_ms", b"sample_age_ms", "session", b"session", "state", b"state", "unsent", b"unsent", "uptime_s", b"uptime_s", "utc_ns", b"utc_ns", "utc_state", b"utc_state"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["captured", b"captured", "clock_jitter_us", b"clock_jitter_us", "clock_rate_ppm", b"clock_rate_ppm", "clock_sigma_us", b"clock_sigma_us", "damaged", b"damaged", "device", b"device", "disk_free_bytes", b"disk_free_bytes", "frame_rate_hz", b"frame_rate_hz", "fsync_ms", b"fsync_ms", "invalid", b"invalid", "measured", b"measured", "missed", b"missed", "no_signal", b"no_signal", "not_recorded", b"not_recorded", "overwritten", b"overwritten", "record_queue", b"record_queue", "record_trouble", b"record_trouble", "recording", b"recording", "repeated", b"repeated", "ring_used", b"ring_used", "sample_age_ms", b"sample_age_ms", "session", b"session", "state", b"state", "unsent", b"unsent", "uptime_s", b"uptime_s", "utc_ns", b"utc_ns", "utc_state", b"utc_state"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
