@@ -132,9 +132,15 @@ def woven(first: Grey, second: Grey, bottom_first: bool = True) -> Grey:
 
 
 def disturbed(
-    clean: Grey, bench: Bench, kind: str, circles: tuple[int, ...], rng: np.random.Generator
+    clean: Grey,
+    bench: Bench,
+    kind: str,
+    circles: tuple[int, ...],
+    rng: np.random.Generator,
+    pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Grey:
-    """`clean` with a disturbance of `kind` on each of `circles`, drawn from `rng`.
+    """`clean` with a disturbance of `kind` on each of `circles` of the marker at `pose`, drawn from
+    `rng`.
 
     glare: a bright spot near the edge. specks: two to five black or white dots of dirt near the
     edge. wire: a dark or bright line across the disc. shadow: half of the disc in 30..80 % of the
@@ -144,8 +150,9 @@ def disturbed(
     y, x = np.mgrid[0 : bench.height_px, 0 : bench.width_px].astype(np.float64)
     out = clean.copy()
     slope, heading = rng.uniform(0.05, 0.3), rng.uniform(0, 2 * pi)
+    homography = bench.moved(*pose)
     for i in circles:
-        ellipse = _Ellipse.of(bench.homography, bench.circles_mm[i], bench.radius_mm)
+        ellipse = _Ellipse.of(homography, bench.circles_mm[i], bench.radius_mm)
         # In these coordinates the disc is the unit circle.
         v = (y - ellipse.centre[1]) / ellipse.half_height
         u = (x - ellipse.centre[0] - ellipse.lean * (y - ellipse.centre[1])) / ellipse.half_chord
