@@ -9,14 +9,17 @@ import sys
 from collections.abc import Sequence
 
 import vdms_replay
-from vdms_replay import recover
+from vdms_replay import info, recover
 from vdms_rt.model import VdmsError
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 
-VERBS = (recover,)
+VERBS = (
+    info,
+    recover,
+)
 
 
 def run(arguments: Sequence[str]) -> int:

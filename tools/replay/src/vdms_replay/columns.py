@@ -68,6 +68,8 @@ class Clock:
     def __init__(self) -> None:
         self.start_ns: int | None = None
         """Of the first sample, on the common scale: UTC where it is known."""
+        self.utc = False
+        """The common scale is UTC."""
         self._offsets_ns: dict[int, int] = {}
 
     def offset_ns(self, session: int, t_ns: int, utc_ns: int) -> int:
@@ -76,7 +78,7 @@ class Clock:
         if offset_ns is None:
             offset_ns = self._offsets_ns[session] = utc_ns - t_ns if utc_ns else 0
             if self.start_ns is None:
-                self.start_ns = t_ns + offset_ns
+                self.start_ns, self.utc = t_ns + offset_ns, bool(utc_ns)
         return offset_ns
 
     def known_offset_ns(self, session: int) -> int:

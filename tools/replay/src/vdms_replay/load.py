@@ -13,11 +13,11 @@ import pandas as pd
 from mcap.records import Attachment, Metadata
 
 from vdms_replay.columns import MEANINGS, UNITS, Clock, Samples, Truths
-from vdms_replay.source import SAMPLE, Damage, Entry, PathLike, ReplayError, Source
+from vdms_replay.source import SAMPLE, Damage, Entry, PathLike, ReplayError, Source, station_of
 from vdms_rt.setup import SetUp, set_up_from_json
 from vdms_rt.wire import vdms_pb2 as pb
 
-ROWS_AT_ONCE = 65536
+ROWS_AT_ONCE = 16384
 PIXELS = "vdms.Pixels"
 
 
@@ -65,7 +65,7 @@ class About:
                 self._entry(item)
 
     def _entry(self, entry: Entry) -> None:
-        station = entry.key.split("/")[1] if entry.key.count("/") > 1 else ""
+        station = station_of(entry.key)
         self.station = self.station or station
         if station and station != self.station:
             raise ReplayError(

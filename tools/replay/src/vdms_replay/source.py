@@ -137,15 +137,24 @@ def _entry(record: StoredMessage, types: Sequence[str] | None, damage: Damage) -
     return Entry(record.channel.topic, message.log_time, message.publish_time, name, value)
 
 
+def by_station(paths: Iterable[PathLike]) -> dict[str, list[Path]]:
+    """Return the files of each station, in the order of their time. Raises ReplayError."""
+    stations: dict[str, list[Path]] = {}
+    for path in _in_order([Path(path) for path in paths]):
+        stations.setdefault(_first(path)[1], []).append(path)
+    return stations
+
+
 def _in_order(paths: list[Path]) -> list[Path]:
     """Return the files by the log time of their first message of ours."""
     if not paths:
         raise ReplayError("no file was named; name a recording of vdms-rt, an .mcap file")
-    begins = {path: _first_time_ns(path) for path in dict.fromkeys(paths)}
+    begins = {path: _first(path)[0] for path in dict.fromkeys(paths)}
     return sorted(begins, key=lambda path: (begins[path], path.name))
 
 
-def _first_time_ns(path: Path) -> int:
+def _first(path: Path) -> tuple[int, str]:
+    """Return log time and station of the file's first message of ours."""
     with open_log(path) as reader:
         for record in reader:
             if (
@@ -153,7 +162,12 @@ def _first_time_ns(path: Path) -> int:
                 and record.schema is not None
                 and record.schema.name in TYPES
             ):
-                return record.message.log_time
+                return record.message.log_time, station_of(record.channel.topic)
         if reader.faults:
             raise ReplayError(f"{path}: damaged, nothing can be read: {reader.faults[0]}")
     raise ReplayError(f"{path}: an MCAP, but not one that vdms-rt recorded, or an empty one")
+
+
+def station_of(key: str) -> str:
+    """Return the station in a key `vdms/<station>/...`; empty if it has none."""
+    return key.split("/")[1] if key.count("/") > 1 else ""
