@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import logging
 import math
 import sys
@@ -12,6 +13,7 @@ from typing import Any
 
 import vdms_rt
 from vdms_rt.config import effective_values, load_config
+from vdms_rt.console import Console, fault_text
 from vdms_rt.model import ConfigError, MarkerShape, VdmsError
 
 EXIT_STOPPED = 0
@@ -28,17 +30,13 @@ def run(arguments: Sequence[str]) -> int:
     try:
         return int(parsed.verb(parsed))
     except ConfigError as error:
-        print(_each_line("vdms-rt: ", error), file=sys.stderr)
+        print(fault_text(error), file=sys.stderr)
         return EXIT_CONFIG
     except VdmsError as error:
-        print(_each_line("vdms-rt: ", error), file=sys.stderr)
+        print(fault_text(error), file=sys.stderr)
         return EXIT_FAILED
     except KeyboardInterrupt:
         return EXIT_STOPPED
-
-
-def _each_line(prefix: str, error: VdmsError) -> str:
-    return "\n".join(prefix + line for line in str(error).splitlines())
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -254,9 +252,10 @@ def _number(text: str, least: float, most: float, rule: str) -> float:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from vdms_rt.console import Console
     from vdms_rt.daemon import Daemon
 
+    # A crash, and the watchdog's SIGABRT, leave on standard error where each thread was.
+    faulthandler.enable()
     config, text = load_config(arguments.config)
     console = Console()
     logging.basicConfig(level=logging.INFO, handlers=[console])

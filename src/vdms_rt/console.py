@@ -9,26 +9,49 @@ import sys
 
 ERASE_TO_END = "\x1b[K"
 
+_PRIORITIES = {logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
+"""Of the journal, sd-daemon(3)."""
+
+
+def in_journal() -> bool:
+    """Return whether standard error goes straight into systemd's journal, systemd.exec(5)."""
+    try:
+        stream = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError):
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{stream.st_dev}:{stream.st_ino}"
+
+
+def fault_text(error: Exception) -> str:
+    """Return an error's sentences as lines for standard error, ready for the journal if that is
+    where they go."""
+    prefix = f"<{_PRIORITIES[logging.ERROR]}>" if in_journal() else "vdms-rt: "
+    return "\n".join(prefix + line for line in str(error).splitlines())
+
 
 class Console(logging.Handler):
     """Writes log records to stderr and, on a terminal, keeps one status line under them.
 
-    Under systemd, which stamps each line of the journal itself, lines carry no time of their own.
+    In the journal, which stamps each line itself, lines carry no time of their own but their
+    priority, so that warnings and errors stand out.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._terminal = sys.stderr.isatty()
+        self._journal = in_journal()
         self._line = ""
-        stamped = "JOURNAL_STREAM" not in os.environ
-        self.setFormatter(
-            logging.Formatter("%(asctime)s %(message)s" if stamped else "%(message)s", "%H:%M:%S")
-        )
+        form = "%(message)s" if self._journal else "%(asctime)s %(message)s"
+        self.setFormatter(logging.Formatter(form, "%H:%M:%S"))
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write one record; logging holds the handler's lock."""
+        text = self.format(record)
+        if self._journal:
+            prefix = f"<{_PRIORITIES.get(record.levelno, 6)}>"
+            text = "\n".join(prefix + line for line in text.splitlines())
         erase = f"\r{ERASE_TO_END}" if self._line else ""
-        sys.stderr.write(f"{erase}{self.format(record)}\n{self._line}")
+        sys.stderr.write(f"{erase}{text}\n{self._line}")
         sys.stderr.flush()
 
     def status(self, text: str) -> None:

@@ -25,10 +25,12 @@ from vdms_rt.config import Config, effective_values, is_live
 from vdms_rt.console import Console
 from vdms_rt.find import Search
 from vdms_rt.logfile.repair import repair_directory
-from vdms_rt.model import Event, Health, Severity, State, VdmsError
+from vdms_rt.model import Displacement, Event, Health, Severity, State, VdmsError
+from vdms_rt.notify import Notifier
 from vdms_rt.outlet import Outlet
 from vdms_rt.process.loop import Processor
 from vdms_rt.publish import Publisher
+from vdms_rt.realtime import lock_memory, scheduling
 from vdms_rt.record import Recorder
 from vdms_rt.ring import Ring
 from vdms_rt.setup import SetUp, SetUpError, load_set_up, save_set_up, set_up_path
@@ -46,6 +48,8 @@ RATE_WINDOW_S = 3.0
 DRAIN_S = 1.5
 """For measuring what is in the ring. After it the rest is given up and counted, and what finds no
 room in the recorder's queue is lost."""
+REPAIR_S = 900
+"""The most that completing what a power cut left of a recording may take: 2 GB on a slow disk."""
 JOIN_S = 2.5
 """A stop takes less than 3 s; a thread that has not ended by then hangs, and is named."""
 
@@ -61,6 +65,8 @@ class Daemon:
         self._signal = ""
         self._kept: SetUp | None = None
         self._faults: list[BaseException] = []
+        self._notifier = Notifier()
+        self._fed: tuple[int, Displacement | None] = (0, None)
         self._started_s = time.monotonic()
         self._rates: deque[tuple[float, int]] = deque()
         live = is_live(config)
@@ -93,7 +99,8 @@ class Daemon:
         Returns the exit status: 0 stopped, 1 failed. Raises VdmsError for what a person can mend
         before anything was measured.
         """
-        with self._signals(), contextlib.ExitStack() as sinks:
+        self._memory_locked = lock_memory()
+        with self._signals(), self._notifier, contextlib.ExitStack() as sinks:
             if self.config.publish.enabled:
                 self._outlet.publisher = sinks.enter_context(
                     Publisher(
@@ -106,6 +113,7 @@ class Daemon:
             if self.config.record.enabled:
                 self._outlet.recorder = self._recorder()
             threads = self._start()
+            self._notifier.ready()
             try:
                 self._supervise(seconds, threads["process"])
             finally:
@@ -122,6 +130,7 @@ class Daemon:
             self._run_end,
             self._outlet.event,
         )
+        self._notifier.busy(REPAIR_S)
         for repaired in repair_directory(Path(record.directory).expanduser()):
             log.warning(repaired.sentence)
         return recorder
@@ -165,6 +174,8 @@ class Daemon:
                 health_due_s += HEALTH_S
                 health = self._health()
                 self._outlet.health(health)
+                self._notifier.status(status_line(health, self._processor.counters.newest))
+            self._feed_watchdog()
             self._keep_set_up()
             self._outlet.tell()
             self._console.status(status_line(health, self._processor.counters.newest))
@@ -172,8 +183,22 @@ class Daemon:
             if seconds and now_s - since_s >= seconds:
                 return
 
+    def _feed_watchdog(self) -> None:
+        """Tell systemd that capture went on since the last time, and process too if it had
+        anything to do. How fast does not matter, so a slow machine is not taken for a hung one;
+        nor does the record thread, because a disk in trouble must not end measuring."""
+        capture = self._capture.counters
+        turns, newest = self._fed
+        captures = capture.turns != turns or capture.ended
+        processes = self._processor.counters.newest is not newest or not self._ring.used
+        if captures and processes:
+            self._fed = (capture.turns, self._processor.counters.newest)
+            self._notifier.progress()
+
     def _shut(self, threads: dict[str, threading.Thread]) -> None:
         """Stop in the order of the data: capture, process, record."""
+        self._notifier.stopping()
+        self._notifier.status(f"{State.STOPPING.value}: {self._reason()}")
         self._stop.set()
         recorder = self._outlet.recorder
         deadline_s = time.monotonic() + JOIN_S
@@ -202,13 +227,14 @@ class Daemon:
         for fault in self._faults:
             if isinstance(fault, VdmsError):
                 raise fault
-            traceback.print_exception(fault)
+            log.critical("failed, please report this:", exc_info=fault)
         health = self._health()
         recorder = self._outlet.recorder
         self._console.block(summary(health, recorder.files if recorder else ()))
         if failure := self._capture.counters.failure:
             log.error(failure)
-        failed = self._faults or failure or health.record_trouble or not health.captured
+        idle = not health.captured and not self._signal
+        failed = self._faults or failure or health.record_trouble or idle
         return 1 if failed else 0
 
     def _stored_set_up(self) -> tuple[SetUp | None, bool]:
@@ -287,6 +313,8 @@ class Daemon:
             *(info.facts if info else ()),
             ("host", platform.node()),
             ("system", platform.platform()),
+            ("scheduling", scheduling()),
+            ("memory", "locked" if self._memory_locked else "not locked"),
             ("python", platform.python_version()),
             ("opencv", cv2.__version__),
             ("numpy", np.__version__),
