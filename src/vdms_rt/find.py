@@ -15,7 +15,8 @@ class Search:
     """A mailbox for one picture and its answer; used by the process and the find thread."""
 
     def __init__(self, shapes: Sequence[MarkerShape]) -> None:
-        self._shapes = tuple(shapes)
+        self.shapes: Sequence[MarkerShape] = tuple(shapes)
+        """What is searched; may be changed between two pictures."""
         self._changed = threading.Condition()
         self._request: tuple[Luma, Scan] | None = None
         self._busy = False
@@ -51,7 +52,7 @@ class Search:
                 request, self._request = self._request, None
             if request is None:
                 continue
-            found = tuple(find_markers(request[0], self._shapes, request[1]))
+            found = tuple(find_markers(request[0], self.shapes, request[1]))
             with self._changed:
                 self._answer = found
                 self._busy = False

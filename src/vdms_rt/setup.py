@@ -40,6 +40,14 @@ class FieldSetUp(_Value):
     limits: Limits | None = None
 
 
+class Zero(_Value):
+    """Where displacement counts from: a pose in the marker plane, relative to the reference."""
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    rotation_mrad: float = 0.0
+
+
 class MarkerSetUp(_Value):
     """One marker's reference; tuples run over its circles."""
 
@@ -50,6 +58,9 @@ class MarkerSetUp(_Value):
     homography: tuple[tuple[float, float, float], ...]
     """3 x 3, marker plane in millimetres to image in pixels, of the mean over the kinds."""
     fields: tuple[FieldSetUp, ...]
+    zero: Zero = Zero()
+    axis_deg: float = 0.0
+    """Direction of x in the marker plane, from the marker's own x towards its y."""
 
     @property
     def reference_px(self) -> tuple[tuple[float, float], ...]:

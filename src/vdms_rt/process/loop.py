@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
+from vdms_rt.command import Applied, Look, Refused, Snapshot
 from vdms_rt.config import Config
 from vdms_rt.measure.gate import Workspace
 from vdms_rt.model import (
@@ -16,6 +21,7 @@ from vdms_rt.model import (
     FoundMarker,
     Frame,
     Luma,
+    MarkerShape,
     Picture,
     Region,
     Scan,
@@ -23,9 +29,11 @@ from vdms_rt.model import (
     State,
     Status,
 )
+from vdms_rt.process.commands import ZERO_SAMPLES, Mailbox, changed, with_axes
 from vdms_rt.process.pictures import pictures
 from vdms_rt.process.progress import Phase, Plan, Progress
 from vdms_rt.process.step import begin, found, step, trusted
+from vdms_rt.process.zero import zeroed
 from vdms_rt.ring import Ring, RingClosed
 from vdms_rt.setup import SetUp, mismatch
 
@@ -50,6 +58,8 @@ class Outlet(Protocol):
 
 class Search(Protocol):
     """The search for markers in a picture, which goes on elsewhere."""
+
+    shapes: Sequence[MarkerShape]
 
     @property
     def busy(self) -> bool: ...
@@ -87,7 +97,7 @@ class Processor:
         self._plan = Plan.of(config)
         self._sampling = config.process.sampling
         self._session = session
-        self._stored = stored
+        self._stored = stored and with_axes(stored, self._plan.axes_deg)
         self._trust = trust_stored
         self._ring = ring
         self._search = search
@@ -96,6 +106,11 @@ class Processor:
         self._asked_ns: int | None = None
         self._told_missing = False
         self._work = Workspace()
+        self.commands = Mailbox()
+        self._recent: dict[str, deque[Displacement]] = {
+            shape.name: deque(maxlen=ZERO_SAMPLES) for shape in self._plan.shapes
+        }
+        self._old_search = False
         if stored is not None and not trust_stored and (why := mismatch(stored, config)):
             outlet.event(
                 Event(Severity.WARNING, "set-up-ignored", f"the stored set-up is ignored: {why}")
@@ -118,12 +133,14 @@ class Processor:
                 self._measure(frame, stop)
 
     def _measure(self, frame: Frame, stop: threading.Event) -> None:
-        progress = self._progress_for(frame)
+        progress, looks = self._commanded(self._progress_for(frame), frame)
+        samples: tuple[Displacement, ...] = ()
         for picture in pictures(frame, self._sampling, progress.order):
             if progress.searched:
                 progress = self._searched(progress, picture, stop)
             before = progress.set_up
             progress, samples, events = step(progress, picture, self._work)
+            samples = zeroed(progress, samples)
             for sample in samples:
                 self._count(sample)
                 self._outlet.displacement(sample)
@@ -134,6 +151,34 @@ class Processor:
         self._outlet.pixels(frame, progress.regions, progress.revision)
         self.counters.state = progress.state
         self._progress = progress
+        for look in looks:
+            look.set_result(_snapshot(frame, progress, samples))
+
+    def _commanded(
+        self, progress: Progress, frame: Frame
+    ) -> tuple[Progress, list[Future[Applied | Snapshot]]]:
+        """Carry out the commands that wait, and return those that only want to see the frame."""
+        looks = []
+        while (waiting := self.commands.take()) is not None:
+            command, answer = waiting
+            if isinstance(command, Look):
+                looks.append(answer)
+                continue
+            first = pictures(frame, self._sampling, progress.order)[0]
+            try:
+                after, text = changed(progress, command, first, self._recent)
+            except Refused as refused:
+                answer.set_exception(refused)
+                continue
+            if after.phase is Phase.SEARCHING and progress.phase is not Phase.SEARCHING:
+                self._old_search, self._asked_ns = self._search.busy, None
+            if after.plan.shapes != progress.plan.shapes:
+                self._search.shapes = after.plan.shapes
+            if after.set_up is not None and after.set_up is not progress.set_up:
+                self._outlet.set_up(after.set_up, frame.image)
+            progress = after
+            answer.set_result(Applied(first.seq, text))
+        return progress, looks
 
     def _progress_for(self, frame: Frame) -> Progress:
         height_px, width_px = frame.image.shape
@@ -143,11 +188,12 @@ class Processor:
         if now is not None and (now.width_px, now.height_px) == (width_px, height_px):
             return now
         revision = now.revision if now else 0
+        plan = dataclasses.replace(now.plan, regions=self._plan.regions) if now else self._plan
         if now is not None:
             text = f"pictures are now {width_px} x {height_px} px; a new reference is needed"
             self._outlet.event(Event(Severity.WARNING, "size-changed", text))
         progress = begin(
-            self._plan,
+            plan,
             self._session,
             width_px,
             height_px,
@@ -171,6 +217,9 @@ class Processor:
         answer = self._search.answer()
         while answer is None and not self._ring.live and self._search.busy and not stop.is_set():
             answer = self._search.answer(TAKE_TIMEOUT_S)
+        if answer is not None and self._old_search:
+            # It is of a picture from before a command that made its question void.
+            self._old_search, self._asked_ns, answer = False, None, None
         if answer is None:
             return progress
         progress, events = found(progress, answer, self._asked_ns or picture.t_ns)
@@ -187,10 +236,26 @@ class Processor:
         elif not sample.status & Status.SET_UP:
             self.counters.invalid += 1
         self.counters.newest = sample
+        self._recent[sample.marker].append(sample)
 
 
 def _at(event: Event, picture: Picture) -> Event:
     return dataclasses.replace(event, t_ns=picture.t_ns, utc_ns=picture.utc_ns)
+
+
+def _snapshot(frame: Frame, progress: Progress, samples: tuple[Displacement, ...]) -> Snapshot:
+    return Snapshot(
+        image=np.array(frame.image),
+        scan=frame.scan,
+        seq=samples[0].seq,
+        t_ns=samples[0].t_ns,
+        utc_ns=samples[0].utc_ns,
+        state=progress.state,
+        width_px=progress.width_px,
+        height_px=progress.height_px,
+        regions=progress.regions,
+        samples=samples,
+    )
 
 
 def _missing(plan: Plan, markers: Sequence[FoundMarker]) -> Event:

@@ -235,6 +235,7 @@ def _marker(
         noise_px=0.0 if math.isnan(noise) else noise,
         homography=homography(np.array(shape.circles_mm), mean_px).tolist(),
         fields=tuple(fields),
+        axis_deg=progress.plan.axes_deg[n],
     )
 
 
