@@ -111,19 +111,63 @@ def test_slow_source_and_pal() -> None:
     assert ticks.clock.figures.rate_ppm == pytest.approx(-200, abs=2)
 
 
-def test_sigma_is_true_over_many_sources() -> None:
-    """Inside two sigma lie about 95 %, never far fewer, at every age of the clock."""
-    inside = np.zeros((16, 5))
-    ages = [slice(0, 15), slice(15, 150), slice(150, 600), slice(600, 1500), slice(1500, 2400)]
-    z_square = []
-    for seed in range(len(inside)):
-        driver = Driver(uniform(1 + seed / 4), rate_ppm=float(seed * 20 - 150))
-        ticks = follow(simulate(driver, 2430, seed), grabber())
-        inside[seed] = [inside_two_sigma(ticks, age) for age in ages]
-        z_square.append(float(np.mean((ticks.error_ns[1500:] / ticks.sigma_ns[1500:]) ** 2)))
-    assert (inside.mean(axis=0) > 0.85).all()
+AGES = [slice(8, 30), slice(30, 60), slice(60, 150), slice(150, 450), slice(450, 900)]
+"""Images since the first: the first quarter of a second aside, up to half a minute."""
+
+
+@pytest.mark.parametrize(
+    "driver",
+    [
+        Driver(uniform(5)),
+        Driver(uniform(1)),
+        Driver(uniform(0.05)),
+        Driver(uniform(5), rate_ppm=-150, lost=0.2),
+        DRIVERS["5 ms uniform, outliers"],
+        DRIVERS["0.3 ms exponential"],
+    ],
+    ids=["5 ms", "1 ms", "0.05 ms", "20 % lost", "outliers", "exponential"],
+)
+def test_sigma_is_true_at_every_age(driver: Driver) -> None:
+    """Error over sigma is 1 rms, and 95 % lie inside two, over many sources."""
+    square, inside = np.zeros((2, 40, len(AGES)))
+    for seed in range(40):
+        ticks = follow(simulate(driver, 920, seed), grabber())
+        square[seed] = [np.mean((ticks.error_ns[a] / ticks.sigma_ns[a]) ** 2) for a in AGES]
+        inside[seed] = [inside_two_sigma(ticks, age) for age in AGES]
+    rms = np.sqrt(square.mean(axis=0))
+    # 40 sources tell each to 0.2 or so. Half a microsecond that quartz may leave is not simulated.
+    assert (rms > 0.45).all()
+    assert (rms < 1.45).all()
+    assert 0.6 < np.sqrt(square.mean()) < 1.2
+    assert (inside.mean(axis=0) > 0.87).all()
     assert inside.mean() > 0.92
-    assert 0.2 < np.mean(z_square) < 1.5
+
+
+def test_sigma_is_true_of_stamps_without_an_edge() -> None:
+    """There it is that of the time beside the delay that the clock settles on, from when a slope
+    can be told from an edge."""
+    inside = []
+    for seed in range(12):
+        ticks = follow(simulate(DRIVERS["1 ms normal"], 2400, seed), grabber())
+        about_ns = ticks.error_ns - ticks.error_ns[1500:].mean()
+        inside.append([np.mean(np.abs(about_ns[a]) <= 2 * ticks.sigma_ns[a]) for a in AGES[2:]])
+    assert (np.mean(inside, axis=0) > [0.6, 0.85, 0.9]).all()
+
+
+def test_sigma_is_true_under_load() -> None:
+    """Lateness comes in waves of a second: fewer stamps count than there are."""
+
+    def waves(random: np.random.Generator, n: int) -> np.ndarray:
+        load = np.zeros(n)
+        for i, push in enumerate(random.normal(size=n - 1)):
+            load[i + 1] = 0.98 * load[i] + 0.2 * push
+        return random.uniform(0, 0.5e6, n) * np.exp(load)
+
+    inside = []
+    for seed in range(12):
+        ticks = follow(simulate(Driver(waves), 2400, seed), grabber())
+        inside.append([inside_two_sigma(ticks, age) for age in (*AGES, slice(900, 2400))])
+    assert (np.mean(inside, axis=0) > 0.87).all()
 
 
 def test_the_first_times_are_usable() -> None:
@@ -133,9 +177,9 @@ def test_the_first_times_are_usable() -> None:
         errors.append(ticks.error_ns[[0, 4, 9, 29, 59]])
         sigmas.append(ticks.sigma_ns[[0, 4, 9, 29, 59]])
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert (rms < [2.5e6, 1.5e6, 0.8e6, 0.4e6, 0.3e6]).all()
-    assert (rms < 1.2 * np.mean(sigmas, axis=0)).all()
-    assert (np.mean(sigmas, axis=0) < 6 * rms).all()
+    assert (rms < [2.5e6, 1.5e6, 0.6e6, 0.3e6, 0.2e6]).all()
+    assert (rms < 1.3 * np.mean(sigmas, axis=0)).all()
+    assert (np.mean(sigmas, axis=0) < 2 * rms).all()
 
 
 def test_the_delay_stays_as_the_clock_settles() -> None:
@@ -288,7 +332,7 @@ def test_uneven_images_have_their_own_stamps() -> None:
     ticks = follow(Record(np.arange(1500), true_ns, stamps_ns, 0), grabber(**CAMERA))
     assert (ticks.error_ns[530:900] == (stamps_ns - true_ns)[530:900]).all()
     assert set(ticks.sigma_ns[530:900]) == {3e6}
-    assert inside_two_sigma(ticks) > 0.97
+    assert inside_two_sigma(ticks) > 0.92
     assert ticks.error_ns[1300:].std() < 50e3
     texts = [event.text for event in told(ticks.clock, "clock-jump")]
     assert any("do not come at an even 30.000 Hz" in text for text in texts)
@@ -303,7 +347,7 @@ def test_a_camera_that_slows_down_in_the_dark_is_followed() -> None:
     ticks = follow(Record(np.arange(1800), true_ns, stamps_ns, 0), grabber(**CAMERA))
     assert ticks.clock.figures.missed == 0
     assert (ticks.index == np.arange(1800)).all()
-    assert inside_two_sigma(ticks) > 0.95
+    assert inside_two_sigma(ticks) > 0.92
     for steady in (slice(900, 1200), slice(1500, 1800)):
         assert ticks.error_ns[steady].std() < 100e3
 

@@ -2,15 +2,21 @@
 
 A stamp is the moment of its picture plus a lateness that is never negative: an interrupt waits for
 its turn. So the earliest stamps tell the time, whatever load does to the others, as in the clock
-skew estimator of Moon, Skelly and Towsley (INFOCOM 1999). The line here minimises the sum of
-rho(r) over the residuals r with rho'(r) = min(r, clip): Huber's loss (1964), one-sided. A large
-clip makes it least squares, a small one the lower envelope. Of several clips that one is to be
-used whose line varies least by the sandwich estimate of its covariance: stamps whose noise has no
-sharp lower edge then get least squares.
+skew estimator of Moon, Skelly and Towsley (INFOCOM 1999).
+
+Where the lateness begins with a sharp edge, `lower_edge` gives the mean and covariance of all lines
+that no stamp lies below, each as likely as the stamps leave it (Bayes): the error falls with the
+number of stamps, not with its root.
+
+Where it does not, `fits` minimises the sum of rho(r) over the residuals r with
+rho'(r) = min(r, clip): Huber's loss (1964), one-sided. A large clip makes it least squares, a small
+one a soft lower envelope. Of several clips that one is to be used whose line varies least by the
+sandwich estimate of its covariance.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -37,6 +43,14 @@ _LEAST_ACTIVE = 12
 _SCALE_FLOOR_NS = 1e3
 _BLOCK = 32
 """Lateness may hang together over a second."""
+
+EDGE = -1
+"""In place of a clip: the line of `lower_edge`."""
+_LIKELY = 16.0
+"""Log of the odds under which a slope does not count."""
+_FAR_BELOW = 12.0
+"""So many mean gaps, and three more for each that is left out, lie stamps below the others that
+are earlier than can be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +85,10 @@ class Lateness:
     """Standard deviation, by the quartiles."""
     deviation_ns: float
     """Standard deviation of all of them."""
+    width_ns: float
+    """Over which the stamps would be spread were they everywhere as dense as above the edge."""
     edge_ns: float
-    """Where the line's lower edge is, on the line's own scale, from the earliest stamps."""
-    edge_sigma_ns: float
+    """Where the lower edge is, from the line."""
     earliest_ns: float
     """The next three are above the edge."""
     median_ns: float
@@ -83,7 +98,7 @@ class Lateness:
     the tail of a normal distribution."""
 
 
-UNSEEN = Lateness(2e6, 2e6, 0.0, 3e6, 0.0, 1.5e6, 5e6, 0.1)
+UNSEEN = Lateness(2e6, 2e6, 3e6, 0.0, 0.0, 1.5e6, 5e6, 0.1)
 """A driver before its first stamp."""
 
 
@@ -179,25 +194,114 @@ def fits(
     return found
 
 
-def lateness(residual: Floats, before: Lateness, weight: float) -> Lateness:
-    """Return how residuals are distributed; while they are few `before` counts as `weight` more."""
+def lower_edge(
+    x: Floats, y: Floats, width_ns: float, known: tuple[float, float], prior: Prior
+) -> tuple[Fit, float]:
+    """Return the line under the stamps and the width of their lateness, in nanoseconds.
+
+    `width_ns` is one to begin with; `known` what is known of it beforehand, and the number of
+    stamps that this counts for. Stamps that are far below all others are left out, one in 512.
+    """
+    n = len(x)
+    # How dense the stamps are above the edge is told by the earliest quarter, by more while that is
+    # few.
+    k = min(n - 1, max(4, min(n // 2, 16), n // 4))
+    weight = known[1] + k
+    about = prior.mean, 40 * prior.sigma
+    single = 1.0
+    for turn in range(4):
+        gap_ns = width_ns / (single * len(x) + 1)
+        line, about = _all_lines(x, y, gap_ns, prior, about)
+        residual = y - line.level - line.slope * x
+        if turn == 2 and (early := n // 512):
+            limit = np.partition(residual, early)[early] - (_FAR_BELOW + 3 * early) * gap_ns
+            x, y, residual = (v[residual >= limit] for v in (x, y, residual))
+        single = independent(residual)
+        above_ns = float(np.partition(residual, k)[k] - residual.min()) + width_ns / (n + 1)
+        above_ns = max(above_ns * (n + 1) / (k + 1), _SCALE_FLOOR_NS)
+        width_ns = math.exp((known[1] * math.log(known[0]) + k * math.log(above_ns)) / weight)
+    # Not even the density is known when stamps are few; and where it goes on to rise above the
+    # earliest ones, what looks like an edge may be the beginning of a slope.
+    tenth, median = np.quantile(residual, (0.1, 0.5))
+    soft_ns = 2 * max(0.0, float(tenth) - float(median) * (0.2 + 1 / math.sqrt(n)))
+    var_level = line.var_level + 3 / weight * gap_ns**2 + soft_ns**2
+    return dataclasses.replace(line, var_level=var_level), width_ns
+
+
+def independent(residual: Floats) -> float:
+    """Return the part of the stamps that count as independent: less than 1 where late ones follow
+    late ones, as under load."""
+    n = len(residual)
+    late = np.sign(residual - np.median(residual))
+    alike = float(late[1:] @ late[:-1]) / n
+    if n < FEW or alike < 3 / math.sqrt(n):
+        return 1.0
+    return max(1 - alike, 1 / n) / (1 + alike)
+
+
+def _all_lines(
+    x: Floats, y: Floats, gap_ns: float, prior: Prior, about: tuple[float, float]
+) -> tuple[Fit, tuple[float, float]]:
+    """Return mean and covariance of the lines under the stamps, whose earliest are `gap_ns` apart
+    if there are no more to come, and the slope and reach within which likely ones were found.
+
+    Of one slope, the highest line touches the lowest stamp, and the distance from the true one is
+    exponential with mean `gap_ns`; a slope is likely as its highest line, at the stamps' middle, is
+    high. `about` is a slope and a reach to begin the search with.
+    """
+    middle = float(x.mean())
+    centred = x - middle
+    centre, reach = about
+    for _ in range(60):
+        slopes = np.linspace(centre - reach, centre + reach, 41)
+        heights = (y - slopes[:, None] * centred).min(axis=1)
+        odds = heights / gap_ns - 0.5 * ((slopes - prior.mean) / prior.sigma) ** 2
+        best = int(np.argmax(odds))
+        likely = np.flatnonzero(odds > odds[best] - _LIKELY)
+        first, last = int(likely[0]), int(likely[-1])
+        if first == 0 or last == 40:
+            centre, reach = float(slopes[best]), 2 * reach
+        elif last - first >= 16:
+            break
+        else:
+            low, high = float(slopes[first - 1]), float(slopes[last + 1])
+            centre, reach = (low + high) / 2, (high - low) / 2
+    weights = np.exp(odds - odds[best])
+    weights /= weights.sum()
+    height, slope = float(weights @ heights), float(weights @ slopes)
+    high, steep = heights - height, slopes - slope
+    var_height = float(weights @ high**2) + gap_ns**2
+    cov, var_slope = float(weights @ (high * steep)), float(weights @ steep**2)
+    line = Fit(
+        clip=EDGE,
+        level=height - gap_ns - slope * middle,
+        slope=slope,
+        var_level=var_height - 2 * middle * cov + middle * middle * var_slope,
+        cov=cov - middle * var_slope,
+        var_slope=var_slope,
+    )
+    return line, (slope, 8 * math.sqrt(var_slope))
+
+
+def lateness(
+    residual: Floats, before: Lateness, weight: float, width_ns: float | None = None
+) -> Lateness:
+    """Return how residuals are distributed; while they are few `before` counts as `weight` more.
+
+    They are those about the lower edge if `width_ns` is given, of their lateness.
+    """
     r = np.sort(residual)
     n = len(r)
     middle = float(r[n // 2])
-    if n < FEW:
-        above = (weight * before.median_ns + (n + 1) * (middle - float(r[0]))) / (weight + n - 1)
-        gap = 2 * above / (n + 1)
-        edge, sigma = float(r[0]) - gap, gap * (1 + 4 / (n + 2))
-    else:
-        weight = 0.0
+    edge = 0.0
+    if width_ns is None:
         # Not the very first where there are many: a few may be earlier than should be.
         k = min(4, n // 128)
-        gap = float(r[k + 8] - r[k]) / 8
-        edge, sigma = float(r[k]) - (k + 1) * gap, gap * math.sqrt((k + 1) + (k + 1) ** 2 / 8)
-        above = middle - edge
-    if n < SHAPE_KNOWN:
-        # Whether the edge is a sharp one is not to be seen yet.
-        sigma = max(sigma, 0.15 * above)
+        reach = min(8, n - 1 - k)
+        gap = float(r[k + reach] - r[k]) / max(reach, 1)
+        edge = float(r[k]) - (k + 1) * gap
+    above = middle - edge
+    weight = weight if n < FEW else 0.0
 
     def together(own: float, known: float) -> float:
         return math.sqrt((weight * known**2 + n * own**2) / (weight + n))
@@ -206,8 +310,8 @@ def lateness(residual: Floats, before: Lateness, weight: float) -> Lateness:
     return Lateness(
         scale_ns=max(together(quartiles, before.scale_ns), _SCALE_FLOOR_NS),
         deviation_ns=together(float(np.std(r)), before.deviation_ns),
+        width_ns=before.width_ns if width_ns is None else width_ns,
         edge_ns=edge,
-        edge_sigma_ns=sigma,
         earliest_ns=float(r[0]) - edge,
         median_ns=above,
         q99_ns=max(float(r[99 * n // 100]) - edge, before.q99_ns if weight else 0.0),

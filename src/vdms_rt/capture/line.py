@@ -17,7 +17,9 @@ from vdms_rt.capture.envelope import (
     Prior,
     fit,
     fits,
+    independent,
     lateness,
+    lower_edge,
 )
 
 WINDOW = 3600
@@ -36,7 +38,7 @@ RATE_KNOWN = 5e-6
 """What the rate of a source may change by in a pause, and"""
 RATE_CHANGED = 20e-6
 """where its stamps no longer agree with those before."""
-SIGMA_FLOOR_NS = 2e3
+SIGMA_FLOOR_NS = 0.5e3
 """What quartz and interrupts leave, however many stamps there are."""
 SETTLED = 48
 """Stamps after which one that does not fit is the source's doing, not the line's."""
@@ -45,7 +47,7 @@ EARLY_LIMIT_NS = 0.5e6
 LATE_LIMIT_NS = 0.5e6
 """Few stamps are later than 99 % were by more than this."""
 
-_UNSEEN_WEIGHT = 3.0
+_UNSEEN_WEIGHT = 1.0
 _SEEN_WEIGHT = 8.0
 """Stamps that the lateness known beforehand counts for, of a driver unseen or seen."""
 _SHARP_KNOWN = 1024
@@ -171,13 +173,7 @@ class StampLine:
 
     def sigma_ns(self, index: int) -> float:
         """Return the standard deviation of `at(index)`, a constant delay aside."""
-        return math.sqrt(self._variance(index) + self._least_variance)
-
-    def _variance(self, index: int) -> float:
-        x = index - self._middle
-        if self._held_scale_ns is None:
-            return self._lateness.edge_sigma_ns**2 + x * x * self._line.var_slope
-        return self._line.variance(x)
+        return math.sqrt(self._line.variance(index - self._middle) + self._least_variance)
 
     def _grid_ns(self, index: int) -> int:
         return index * self._numerator // self._denominator
@@ -197,7 +193,7 @@ class StampLine:
             self._before, self._weight, self._votes = shape, _SEEN_WEIGHT, 0
             keep = _to_keep(self._refit())
         self._since = 0
-        if self.count > ENOUGH and self._variance(latest) < ENOUGH_NS**2:
+        if self.count > ENOUGH and self._line.variance(latest - self._middle) < ENOUGH_NS**2:
             self._first += (self.count - ENOUGH) // 4
         span_s = self.count * self._period / 1e9
         bend_ns = DRIFT * span_s * span_s / 12 * 1e9
@@ -211,20 +207,25 @@ class StampLine:
         used = slice(self._first, self._end)
         middle = int(self._x[self._first] + self._x[self._end - 1]) // 2
         x, y = (self._x[used] - middle).astype(np.float64), self._y[used]
-        line = self._line
-        start = line.level + line.slope * (middle - self._middle), line.slope
-        scale = self._held_scale_ns or self._lateness.scale_ns
-        line = self._choose(x, y, scale, start)
+        line, width_ns = self._fitted(x, y, middle)
         if len(x) >= FEW and abs(line.slope - self._prior.mean) > 2.5 * self._prior.sigma:
             self._prior = Prior(line.slope, RATE_LOOSE * self._period)
-            line = self._choose(x, y, scale, start)
+            line, width_ns = self._fitted(x, y, middle)
         self._line, self._middle = line, middle
         residual: Floats = y - line.level - line.slope * x
-        self._lateness = lateness(residual, self._before, self._weight)
-        self._vote(len(x), scale)
-        if self._held_scale_ns is None:
-            self._depth_ns = self._lateness.edge_ns
+        self._lateness = lateness(residual, self._before, self._weight, width_ns)
+        self._vote(len(x), self._lateness.scale_ns)
         return residual
+
+    def _fitted(self, x: Floats, y: Floats, middle: int) -> tuple[Fit, float | None]:
+        """Return the line about a new middle, and the width of the lateness if it has an edge."""
+        before = self._line
+        start = before.level + before.slope * (middle - self._middle), before.slope
+        if self._held_scale_ns is None:
+            self._depth_ns = 0.0
+            known = self._before.width_ns, self._weight
+            return lower_edge(x, y, self._lateness.width_ns, known, self._prior)
+        return self._choose(x, y, self._held_scale_ns, start), None
 
     def _vote(self, n: int, scale: float) -> None:
         """Hold the distance from line to edge while there is no sharp edge: the line alone tells
@@ -234,7 +235,7 @@ class StampLine:
         against = self._lateness.softness < _SHARP if held else self._lateness.softness > SOFT
         self._votes = self._votes + 1 if known and against else 0
         if self._votes == _VOTES:
-            self._votes = 0
+            self._votes = self._until_choice = 0
             self._held_scale_ns = None if held else scale
 
     def _choose(self, x: Floats, y: Floats, scale: float, start: tuple[float, float]) -> Fit:
@@ -251,9 +252,9 @@ class StampLine:
         best = min(found.values(), key=lambda f: f.variance(end))
         if now in found and found[now].variance(end) < 1.5 * best.variance(end):
             best = found[now]
-        if self._held_scale_ns is not None and best.clip != now:
-            reported = (found[now].level if now in found else start[0]) + self._depth_ns
-            self._depth_ns = reported - best.level
+        if best.clip != now:
+            level, slope = (found[now].level, found[now].slope) if now in found else start
+            self._depth_ns += level - best.level + (slope - best.slope) * end
         return best
 
 
@@ -263,11 +264,12 @@ def _to_keep(residual: Floats) -> int:
     n = len(residual)
     if n < SHAPE_KNOWN:
         return 0
+    single = math.sqrt(independent(residual))
     early = residual < np.partition(residual, n // 10)[n // 10]
     recent = 64
     while recent <= n // 2:
         part = int(early[-recent:].sum()) / recent
-        if _surprise(part, 0.1, recent) * math.sqrt(1 - recent / n) > _CHANGED:
+        if _surprise(part, 0.1, recent) * single * math.sqrt(1 - recent / n) > _CHANGED:
             # Where early ones have become rare, the last of them was before the change.
             since = int(np.argmax(early[::-1])) if part < 0.1 else recent
             return max(min(since, recent), _LEAST_KEPT)
@@ -276,7 +278,7 @@ def _to_keep(residual: Floats) -> int:
         count = int(part * n)
         excess = np.abs(np.cumsum((residual < np.partition(residual, count)[count]) - count / n))
         most = int(np.argmax(excess))
-        if excess[most] > _UNEVEN * math.sqrt(part * (1 - part) * n):
+        if excess[most] * single > _UNEVEN * math.sqrt(part * (1 - part) * n):
             return max(n - 1 - most, _LEAST_KEPT)
     return 0
 

@@ -8,7 +8,17 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vdms_rt.capture.envelope import SOFT, UNSEEN, Fit, Floats, Lateness, Prior, fits, lateness
+from vdms_rt.capture.envelope import (
+    SOFT,
+    UNSEEN,
+    Fit,
+    Floats,
+    Lateness,
+    Prior,
+    fits,
+    lateness,
+    lower_edge,
+)
 from vdms_rt.capture.line import WINDOW
 
 Times: TypeAlias = NDArray[np.int64]
@@ -59,19 +69,17 @@ def _times(stamps: Times, places: Times, period_ns: Fraction) -> Times:
     windows = _windows(len(y))
     prior = Prior(0.0, _RATE_SIGMA * float(period_ns))
     middles = np.array([float(places[w.start] + places[w.stop - 1]) / 2 for w in windows])
-    fitted = [
-        _lines(places[w] - middle, y[w], prior) for w, middle in zip(windows, middles, strict=True)
-    ]
-    clip = _best_clip(fitted, windows)
-    lines = [found[clip] for found, _ in fitted]
-    shapes = [
-        lateness(y[w] - line.level - line.slope * (places[w] - middle), before, 1.0)
-        for w, middle, line, (_, before) in zip(windows, middles, lines, fitted, strict=True)
-    ]
-    edges = np.array([shape.edge_ns for shape in shapes])
-    if np.median([shape.softness for shape in shapes]) > SOFT:
-        edges[:] = np.median(edges)
-    levels = np.array([line.level for line in lines]) + edges
+    parts = [(places[w] - middle, y[w]) for w, middle in zip(windows, middles, strict=True)]
+    lines = [lower_edge(*part, UNSEEN.width_ns, (UNSEEN.width_ns, 1.0), prior)[0] for part in parts]
+    soft = [_about(*part, line).softness for part, line in zip(parts, lines, strict=True)]
+    depth_ns = 0.0
+    if np.median(soft) > SOFT:
+        fitted = [_lines(*part, prior) for part in parts]
+        clip = _best_clip(fitted, windows)
+        lines = [found[clip] for found in fitted]
+        shapes = [_about(*part, line) for part, line in zip(parts, lines, strict=True)]
+        depth_ns = float(np.median([shape.edge_ns for shape in shapes]))
+    levels = np.array([line.level for line in lines]) + depth_ns
     slopes = np.array([line.slope for line in lines])
     residual = _blend(places.astype(np.float64), middles, levels, slopes)
     result: Times = grid + np.rint(residual).astype(np.int64)
@@ -85,27 +93,29 @@ def _windows(n: int) -> list[slice]:
     return [slice(start, start + WINDOW) for start in starts]
 
 
-def _lines(x: Floats, y: Floats, prior: Prior) -> tuple[dict[int, Fit], Lateness]:
-    """Return the lines of all clips that a window can carry, and the lateness about the widest."""
+def _about(x: Floats, y: Floats, line: Fit) -> Lateness:
+    return lateness(y - line.level - line.slope * x, UNSEEN, 1.0)
+
+
+def _lines(x: Floats, y: Floats, prior: Prior) -> dict[int, Fit]:
+    """Return the lines of all clips that a window can carry."""
     third = max(1, len(x) // 3)
     rise = float(np.median(y[-third:]) - np.median(y[:third]))
     run = float(np.median(x[-third:]) - np.median(x[:third]))
     slope = rise / run if run else 0.0
     level = float(np.median(y - slope * x))
-    shape = lateness(y - level - slope * x, UNSEEN, 1.0)
-    found = fits(x, y, range(1), shape.scale_ns, (level, slope), prior)
-    widest = found[0]
-    shape = lateness(y - widest.level - widest.slope * x, UNSEEN, 1.0)
-    return fits(x, y, None, shape.scale_ns, (widest.level, widest.slope), prior), shape
+    scale_ns = lateness(y - level - slope * x, UNSEEN, 1.0).scale_ns
+    widest = fits(x, y, range(1), scale_ns, (level, slope), prior)[0]
+    return fits(x, y, None, _about(x, y, widest).scale_ns, (widest.level, widest.slope), prior)
 
 
-def _best_clip(fitted: list[tuple[dict[int, Fit], Lateness]], windows: list[slice]) -> int:
+def _best_clip(fitted: list[dict[int, Fit]], windows: list[slice]) -> int:
     """Return the clip whose lines vary least over all windows."""
-    common = set.intersection(*(set(found) for found, _ in fitted))
+    common = set.intersection(*(set(found) for found in fitted))
 
     def spread(clip: int) -> float:
         total = 0.0
-        for (found, _), window in zip(fitted, windows, strict=True):
+        for found, window in zip(fitted, windows, strict=True):
             width = float(window.stop - window.start)
             total += found[clip].var_level + found[clip].var_slope * width * width / 12
         return total
