@@ -71,12 +71,14 @@ class Block:
     content: bytes
     records: list[LogRecord] = field(default_factory=list)
     chunk: Chunk | None = None
+    offset: int = 0
+    """Where it stands in the file."""
     orphans: int = 0
     """Messages of channels that nothing readable defines."""
 
 
 class LogReader:
-    """Reads one file once, from its beginning, in bounded memory.
+    """Reads one file in bounded memory, from its beginning or from any block known by then.
 
     Only what its checksum confirms is given out: a damaged chunk is left out as a whole, and
     reading goes on with the next one.
@@ -125,9 +127,12 @@ class LogReader:
         for block in self.blocks():
             yield from block.records
 
-    def blocks(self) -> Iterator[Block]:
-        """Give every readable record of the top level of the data section."""
-        offset = len(MAGIC)
+    def blocks(self, start: int = len(MAGIC)) -> Iterator[Block]:
+        """Give every readable record of the top level of the data section.
+
+        `start` is the `offset` of a block that was given before, to go on from there.
+        """
+        offset = start
         while offset < self.size_bytes:
             block = self._block_at(offset)
             if block is None:
@@ -160,7 +165,7 @@ class LogReader:
         content = self._file.read(length)
         if opcode == Opcode.CHUNK and not _chunk_is_consistent(content):
             return None
-        return Block(opcode, content)
+        return Block(opcode, content, offset=offset)
 
     def _find_chunk(self, offset: int) -> int:
         """Return where the next chunk begins, or the size of the file."""
