@@ -454,3 +454,49 @@ class FoundMarker:
     contrast: float
     score: float = field(default=0.0)
     """Root mean square misfit to the shape, in pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """How the camera sees a marker. Lengths in millimetres are along the marker's own x and y."""
+
+    marker: str
+    scale_x_px_per_mm: float
+    scale_y_px_per_mm: float
+    pixel_aspect: float
+    """Taken for the angles: pixels per unit length along a row over pixels along a column."""
+    angle_deg: float
+    """Between the line of sight and the marker's normal."""
+    angle_error_deg: float
+    """What an error of 1 % of `pixel_aspect` makes of it: much near 0, little at 60."""
+    turn_deg: float
+    """The angle's part about the marker's vertical; positive: the right side is the farther one."""
+    side_known: bool
+    """Perspective shows which side is the farther one; if not, `turn_deg` is positive."""
+    roll_deg: float
+    """How far the marker appears turned counter-clockwise in the picture."""
+    disc_px: float
+    """Smallest extent of the smallest circle."""
+    edge_x_px: float
+    edge_y_px: float
+    """Widths of the blurred edge, as standard deviations, the pixel's own included."""
+    focus: str
+    """`sharp`, `a little soft` or `out of focus`."""
+    black_grey: float
+    white_grey: float
+    contrast_grey: float
+    """Of the faintest circle."""
+    saturated_percent: float
+    """Of the brightest disc; of a dark disc, of the sheet around it."""
+    noise_grey: float
+    """Standard deviation, the rounding to whole grey levels included."""
+    sigma_x_mm: float
+    sigma_y_mm: float
+    """Standard deviation of one sample of the marker at rest."""
+    left_mm: float
+    right_mm: float
+    up_mm: float
+    down_mm: float
+    """How far the marker may go before a circle touches the picture's border."""
+    advice: tuple[str, ...]
+    """What to do, one sentence each, the most important first; empty if all is well."""

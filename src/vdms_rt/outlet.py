@@ -104,9 +104,15 @@ class Outlet:
             counts[event.code] += 1
             if counts[event.code] <= TOLD_OF_A_CODE:
                 log.log(LEVELS[event.severity], event.text)
+            if event.code == "reference" and self.newest_set_up is not None:
+                self._tell_set_up(self.newest_set_up)
         for code, count in counts.items():
             if count > TOLD_OF_A_CODE:
                 log.warning("%d more events: %s", count - TOLD_OF_A_CODE, code)
+
+    def _tell_set_up(self, set_up: SetUp) -> None:
+        advised = any(m.aim is not None and m.aim.advice for m in set_up.markers)
+        log.log(logging.WARNING if advised else logging.INFO, set_up_report(set_up))
 
     def set_up(self, set_up: SetUp, image: Luma) -> None:
         """Say the set-up now in force; `image` is a picture taken with it."""
@@ -117,7 +123,9 @@ class Outlet:
             revision=set_up.revision,
             json=set_up_json(set_up),
             report=set_up_report(set_up),
+            aims=[convert.aim_message(m.aim) for m in set_up.markers if m.aim is not None],
         )
+        self.newest_set_up_message = message
         self._say(topics.SETUP, "", self.now_ns(), message.SerializeToString())
         if self.recorder is not None:
             self.recorder.attach("reference.png", "image/png", codec.png(image))

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from vdms_rt.config import Config, SetUpSection
 from vdms_rt.measure.expect import Appearance
 from vdms_rt.measure.validity import Limits
-from vdms_rt.model import MarkerShape, Region, Scan, VdmsError
+from vdms_rt.model import Aim, MarkerShape, Region, Scan, VdmsError
 
 
 class SetUpError(VdmsError):
@@ -61,6 +61,8 @@ class MarkerSetUp(_Value):
     zero: Zero = Zero()
     axis_deg: float = 0.0
     """Direction of x in the marker plane, from the marker's own x towards its y."""
+    aim: Aim | None = None
+    """How the camera saw it when the reference was taken."""
 
     @property
     def reference_px(self) -> tuple[tuple[float, float], ...]:

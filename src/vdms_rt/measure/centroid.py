@@ -16,6 +16,10 @@ MIN_AREA_PX = 20.0
 MAX_AREA_PART = 0.8
 """Of the region. An ellipse that does not touch the border fills at most pi/4 of it."""
 
+OTSU_MOVING_PX = 0.05
+"""Standard deviation of a coordinate of `otsu_circle` while the circle moves across the pixels, for
+circles of 30 to 80 px: each edge pixel counts whole or not at all."""
+
 _INDEX = np.arange(8192, dtype=np.float64)
 
 

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vdms_rt.measure.centroid import otsu_circle, otsu_semi_axes
-from vdms_rt.measure.expect import first_look
+from vdms_rt.measure.aim import aim, aim_of, first_study
+from vdms_rt.measure.centroid import OTSU_MOVING_PX, otsu_circle, otsu_semi_axes
 from vdms_rt.measure.gate import Workspace
 from vdms_rt.measure.homography import homography
 from vdms_rt.measure.regions import check_circles
-from vdms_rt.measure.smooth import CircleReading, Slow, first_slow, measure, study
+from vdms_rt.measure.smooth import CircleReading, Slow
 from vdms_rt.measure.still import is_still, noise_px
 from vdms_rt.measure.validity import learn
 from vdms_rt.model import (
     UNUSABLE_CIRCLE,
+    Aim,
     Circle,
     CircleFlag,
     ConfigError,
@@ -63,7 +64,7 @@ def gather(
     elif progress.phase is Phase.CHECKING:
         progress, events = _checked(progress, by_kind)
     else:
-        progress, events = _referenced(progress, picture, by_kind)
+        progress, events = _referenced(progress, picture, by_kind, work)
     return progress, circles, events
 
 
@@ -74,23 +75,25 @@ def _look(progress: Progress, picture: Picture, work: Workspace) -> Still:
         rows = (picture.row_offset, picture.row_step)
         own = [otsu_circle(picture.image, r, shape.white_on_black, *rows) for r in regions]
         if progress.plan.method == "smooth" and not any(c.flags & UNUSABLE_CIRCLE for c in own):
-            expected = first_look(
-                tuple((c.x_px, c.y_px) for c in own),
-                tuple(
-                    otsu_semi_axes(picture.image, r, shape.white_on_black, *rows) for r in regions
-                ),
+            studied = first_study(
+                picture.image, *rows, *_places(picture, regions, own, shape.white_on_black), work
             )
-            begin = first_slow(len(own))
-            seen, _ = measure(picture.image, *rows, expected, begin, work)
-            # The slope of light that lies on the discs at rest is theirs: with it expected, it is
-            # not divided out here, as it will not be later.
-            expected = expected._replace(light_per_px=tuple(r.light_per_px for r in seen))
-            studied = study(picture.image, *rows, expected, begin, work)
             readings.append(studied)
             own = [circle_of(r, CircleFlag.NONE) for r in studied[0]]
         circles += own
     return Still(
         picture.kind, picture.row_offset, picture.row_step, tuple(circles), tuple(readings)
+    )
+
+
+def _places(
+    picture: Picture, regions: Sequence[Region], circles: Sequence[Circle], white: bool
+) -> tuple[tuple[tuple[float, float], ...], tuple[tuple[float, float], ...]]:
+    """Return the centres and the semi-axes of circles in their regions."""
+    rows = (picture.row_offset, picture.row_step)
+    return (
+        tuple((c.x_px, c.y_px) for c in circles),
+        tuple(otsu_semi_axes(picture.image, r, white, *rows) for r in regions),
     )
 
 
@@ -151,7 +154,7 @@ def _checked(
 
 
 def _referenced(
-    progress: Progress, picture: Picture, by_kind: dict[Scan, list[Still]]
+    progress: Progress, picture: Picture, by_kind: dict[Scan, list[Still]], work: Workspace
 ) -> tuple[Progress, tuple[Event, ...]]:
     last = next(iter(by_kind.values()))[-1]
     if faults := check_circles(last.circles):
@@ -162,7 +165,9 @@ def _referenced(
         own = slice(first, first + len(regions))
         first += len(regions)
         try:
-            markers.append(_marker(progress, n, own, by_kind))
+            marker = _marker(progress, n, own, by_kind)
+            seen = _aim(progress, picture, last.circles[own], marker, work)
+            markers.append(marker.model_copy(update={"aim": seen}))
         except VdmsError as error:
             event = Event(Severity.WARNING, "no-homography", f"marker {shape.name}: {error}")
             return dataclasses.replace(progress, stills=()), (event,)
@@ -175,17 +180,18 @@ def _referenced(
         scan=frame_scan(picture),
         method=progress.plan.method,
         stills=count * len(by_kind),
-        markers=tuple(markers),
+        markers=tuple(_steadied(markers)),
     )
     text = f"reference taken from {set_up.stills} pictures, set-up revision {set_up.revision}"
+    period_ns = picture.period_ns * picture.row_step
     return (
         dataclasses.replace(
             progress,
             phase=Phase.MEASURING,
             set_up=set_up,
-            watches=watches_of(
-                set_up, progress.plan, picture.exposure_ns, picture.period_ns * picture.row_step
-            ),
+            watches=watches_of(set_up, progress.plan, picture.exposure_ns, period_ns),
+            exposure_ns=picture.exposure_ns,
+            period_ns=period_ns,
             revision=set_up.revision,
             stills=(),
             waiting=False,
@@ -237,6 +243,57 @@ def _marker(
         fields=tuple(fields),
         axis_deg=progress.plan.axes_deg[n],
     )
+
+
+def _aim(
+    progress: Progress,
+    picture: Picture,
+    circles: tuple[Circle, ...],
+    marker: MarkerSetUp,
+    work: Workspace,
+) -> Aim:
+    """Return how the camera sees a marker whose `circles` are in the picture."""
+    aspect = progress.plan.lens.pixel_aspect
+    for field in marker.fields:
+        if field.kind is picture.kind and field.appearance is not None:
+            return aim_of(
+                picture.image,
+                picture.row_offset,
+                progress.height_px,
+                marker.shape,
+                field.appearance,
+                aspect,
+            )
+    seen = aim(
+        picture.image,
+        picture.row_offset,
+        picture.row_step,
+        progress.height_px,
+        marker.shape,
+        *_places(picture, marker.regions, circles, marker.shape.white_on_black),
+        aspect,
+        work,
+    )
+    sigma_px = math.hypot(marker.noise_px, OTSU_MOVING_PX) / math.sqrt(len(circles))
+    return dataclasses.replace(
+        seen,
+        sigma_x_mm=sigma_px / seen.scale_x_px_per_mm,
+        sigma_y_mm=sigma_px / seen.scale_y_px_per_mm,
+    )
+
+
+def _steadied(markers: Sequence[MarkerSetUp]) -> Iterator[MarkerSetUp]:
+    """Give the markers with the fixed marker's errors in what is expected of the others."""
+    fixed = next((m.aim for m in markers if m.shape.fixed), None)
+    for marker in markers:
+        seen = marker.aim
+        if seen is not None and fixed is not None and not marker.shape.fixed:
+            seen = dataclasses.replace(
+                seen,
+                sigma_x_mm=math.hypot(seen.sigma_x_mm, fixed.sigma_x_mm),
+                sigma_y_mm=math.hypot(seen.sigma_y_mm, fixed.sigma_y_mm),
+            )
+        yield marker.model_copy(update={"aim": seen})
 
 
 def frame_scan(picture: Picture) -> Scan:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vdms_rt.model import (
+    Aim,
     Circle,
     CircleFlag,
     Displacement,
@@ -150,6 +151,18 @@ def event_from(data: bytes) -> Event:
         utc_ns=m.utc_ns,
         facts=tuple((f.name, f.value) for f in m.facts),
     )
+
+
+def aim_message(a: Aim) -> pb.Aim:
+    """Return how the camera sees a marker as a `vdms.Aim` message."""
+    return pb.Aim(**{name: getattr(a, name) for name in Aim.__dataclass_fields__})
+
+
+def aim_from(m: pb.Aim) -> Aim:
+    """Return how the camera sees a marker, from a `vdms.Aim` message."""
+    values = {name: getattr(m, name) for name in Aim.__dataclass_fields__}
+    values["advice"] = tuple(m.advice)
+    return Aim(**values)
 
 
 def health_message(h: Health) -> pb.Health:

@@ -471,11 +471,16 @@ class SetUp(_message.Message):
     REVISION_FIELD_NUMBER: _builtins.int
     JSON_FIELD_NUMBER: _builtins.int
     REPORT_FIELD_NUMBER: _builtins.int
+    AIMS_FIELD_NUMBER: _builtins.int
     session: _builtins.int
     utc_ns: _builtins.int
     revision: _builtins.int
     json: _builtins.str
     report: _builtins.str
+    @_builtins.property
+    def aims(self) -> _containers.RepeatedCompositeFieldContainer[Global___Aim]:
+        """one for each marker, when the reference was taken"""
+
     def __init__(
         self,
         *,
@@ -484,14 +489,127 @@ class SetUp(_message.Message):
         revision: _builtins.int = ...,
         json: _builtins.str = ...,
         report: _builtins.str = ...,
+        aims: _abc.Iterable[Global___Aim] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["json", b"json", "report", b"report", "revision", b"revision", "session", b"session", "utc_ns", b"utc_ns"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["aims", b"aims", "json", b"json", "report", b"report", "revision", b"revision", "session", b"session", "utc_ns", b"utc_ns"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___SetUp: _TypeAlias = SetUp  # noqa: Y015
+
+@_typing.final
+class Aim(_message.Message):
+    """How the camera sees a marker; millimetres are along the marker's own x and y."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MARKER_FIELD_NUMBER: _builtins.int
+    SCALE_X_PX_PER_MM_FIELD_NUMBER: _builtins.int
+    SCALE_Y_PX_PER_MM_FIELD_NUMBER: _builtins.int
+    PIXEL_ASPECT_FIELD_NUMBER: _builtins.int
+    ANGLE_DEG_FIELD_NUMBER: _builtins.int
+    ANGLE_ERROR_DEG_FIELD_NUMBER: _builtins.int
+    TURN_DEG_FIELD_NUMBER: _builtins.int
+    SIDE_KNOWN_FIELD_NUMBER: _builtins.int
+    ROLL_DEG_FIELD_NUMBER: _builtins.int
+    DISC_PX_FIELD_NUMBER: _builtins.int
+    EDGE_X_PX_FIELD_NUMBER: _builtins.int
+    EDGE_Y_PX_FIELD_NUMBER: _builtins.int
+    FOCUS_FIELD_NUMBER: _builtins.int
+    BLACK_GREY_FIELD_NUMBER: _builtins.int
+    WHITE_GREY_FIELD_NUMBER: _builtins.int
+    CONTRAST_GREY_FIELD_NUMBER: _builtins.int
+    SATURATED_PERCENT_FIELD_NUMBER: _builtins.int
+    NOISE_GREY_FIELD_NUMBER: _builtins.int
+    SIGMA_X_MM_FIELD_NUMBER: _builtins.int
+    SIGMA_Y_MM_FIELD_NUMBER: _builtins.int
+    LEFT_MM_FIELD_NUMBER: _builtins.int
+    RIGHT_MM_FIELD_NUMBER: _builtins.int
+    UP_MM_FIELD_NUMBER: _builtins.int
+    DOWN_MM_FIELD_NUMBER: _builtins.int
+    ADVICE_FIELD_NUMBER: _builtins.int
+    marker: _builtins.str
+    scale_x_px_per_mm: _builtins.float
+    scale_y_px_per_mm: _builtins.float
+    pixel_aspect: _builtins.float
+    """taken for the angles: pixels per length in a row over in a column"""
+    angle_deg: _builtins.float
+    """between the line of sight and the marker's normal"""
+    angle_error_deg: _builtins.float
+    """for 1 % of error of pixel_aspect"""
+    turn_deg: _builtins.float
+    """the angle's part about the marker's vertical; positive: the right"""
+    side_known: _builtins.bool
+    """side is the farther one
+    if not, turn_deg is positive
+    """
+    roll_deg: _builtins.float
+    """counter-clockwise in the picture"""
+    disc_px: _builtins.float
+    """smallest extent of the smallest circle"""
+    edge_x_px: _builtins.float
+    """standard deviation of the blurred edge"""
+    edge_y_px: _builtins.float
+    focus: _builtins.str
+    """"sharp", "a little soft", "out of focus" """
+    black_grey: _builtins.float
+    white_grey: _builtins.float
+    contrast_grey: _builtins.float
+    """of the faintest circle"""
+    saturated_percent: _builtins.float
+    """of the brightest disc, or of the sheet around a dark one"""
+    noise_grey: _builtins.float
+    """standard deviation"""
+    sigma_x_mm: _builtins.float
+    """of one sample at rest"""
+    sigma_y_mm: _builtins.float
+    left_mm: _builtins.float
+    """that the marker may go before a circle touches the border"""
+    right_mm: _builtins.float
+    up_mm: _builtins.float
+    down_mm: _builtins.float
+    @_builtins.property
+    def advice(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """what to do, a sentence each; none if all is well"""
+
+    def __init__(
+        self,
+        *,
+        marker: _builtins.str = ...,
+        scale_x_px_per_mm: _builtins.float = ...,
+        scale_y_px_per_mm: _builtins.float = ...,
+        pixel_aspect: _builtins.float = ...,
+        angle_deg: _builtins.float = ...,
+        angle_error_deg: _builtins.float = ...,
+        turn_deg: _builtins.float = ...,
+        side_known: _builtins.bool = ...,
+        roll_deg: _builtins.float = ...,
+        disc_px: _builtins.float = ...,
+        edge_x_px: _builtins.float = ...,
+        edge_y_px: _builtins.float = ...,
+        focus: _builtins.str = ...,
+        black_grey: _builtins.float = ...,
+        white_grey: _builtins.float = ...,
+        contrast_grey: _builtins.float = ...,
+        saturated_percent: _builtins.float = ...,
+        noise_grey: _builtins.float = ...,
+        sigma_x_mm: _builtins.float = ...,
+        sigma_y_mm: _builtins.float = ...,
+        left_mm: _builtins.float = ...,
+        right_mm: _builtins.float = ...,
+        up_mm: _builtins.float = ...,
+        down_mm: _builtins.float = ...,
+        advice: _abc.Iterable[_builtins.str] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["advice", b"advice", "angle_deg", b"angle_deg", "angle_error_deg", b"angle_error_deg", "black_grey", b"black_grey", "contrast_grey", b"contrast_grey", "disc_px", b"disc_px", "down_mm", b"down_mm", "edge_x_px", b"edge_x_px", "edge_y_px", b"edge_y_px", "focus", b"focus", "left_mm", b"left_mm", "marker", b"marker", "noise_grey", b"noise_grey", "pixel_aspect", b"pixel_aspect", "right_mm", b"right_mm", "roll_deg", b"roll_deg", "saturated_percent", b"saturated_percent", "scale_x_px_per_mm", b"scale_x_px_per_mm", "scale_y_px_per_mm", b"scale_y_px_per_mm", "side_known", b"side_known", "sigma_x_mm", b"sigma_x_mm", "sigma_y_mm", b"sigma_y_mm", "turn_deg", b"turn_deg", "up_mm", b"up_mm", "white_grey", b"white_grey"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Aim: _TypeAlias = Aim  # noqa: Y015
 
 @_typing.final
 class Run(_message.Message):
@@ -634,6 +752,8 @@ class Pixels(_message.Message):
     HEIGHT_PX_FIELD_NUMBER: _builtins.int
     PATCHES_FIELD_NUMBER: _builtins.int
     PERIOD_NS_FIELD_NUMBER: _builtins.int
+    EXPOSURE_NS_FIELD_NUMBER: _builtins.int
+    ORDER_KNOWN_FIELD_NUMBER: _builtins.int
     frame_seq: _builtins.int
     scan: Global___Scan.ValueType
     stamp_ns: _builtins.int
@@ -649,6 +769,10 @@ class Pixels(_message.Message):
     height_px: _builtins.int
     period_ns: _builtins.int
     """from one frame to the next"""
+    exposure_ns: _builtins.int
+    """of each field, or of a progressive frame"""
+    order_known: _builtins.bool
+    """the order of the fields is a fact, not a driver's habit"""
     @_builtins.property
     def patches(self) -> _containers.RepeatedCompositeFieldContainer[Global___Patch]: ...
     def __init__(
@@ -667,11 +791,53 @@ class Pixels(_message.Message):
         height_px: _builtins.int = ...,
         patches: _abc.Iterable[Global___Patch] | None = ...,
         period_ns: _builtins.int = ...,
+        exposure_ns: _builtins.int | None = ...,
+        order_known: _builtins.bool = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_exposure_ns", b"_exposure_ns", "exposure_ns", b"exposure_ns"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_exposure_ns", b"_exposure_ns", "damage", b"damage", "exposure_ns", b"exposure_ns", "frame_seq", b"frame_seq", "height_px", b"height_px", "order_known", b"order_known", "patches", b"patches", "period_ns", b"period_ns", "scan", b"scan", "segment", b"segment", "setup_revision", b"setup_revision", "sigma_t_ns", b"sigma_t_ns", "stamp_ns", b"stamp_ns", "t_ns", b"t_ns", "utc_ns", b"utc_ns", "width_px", b"width_px"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__exposure_ns: _TypeAlias = _typing.Literal["exposure_ns"]  # noqa: Y015
+    _WhichOneofArgType__exposure_ns: _TypeAlias = _typing.Literal["_exposure_ns", b"_exposure_ns"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__exposure_ns) -> _WhichOneofReturnType__exposure_ns | None: ...
+
+Global___Pixels: _TypeAlias = Pixels  # noqa: Y015
+
+@_typing.final
+class Checkpoint(_message.Message):
+    """All that measuring knows before a picture besides the set-up: from here it goes on with the same
+    numbers. Said once a second, and after whatever else than a picture has changed it.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SESSION_FIELD_NUMBER: _builtins.int
+    SEQ_FIELD_NUMBER: _builtins.int
+    T_NS_FIELD_NUMBER: _builtins.int
+    SETUP_REVISION_FIELD_NUMBER: _builtins.int
+    JSON_FIELD_NUMBER: _builtins.int
+    session: _builtins.int
+    seq: _builtins.int
+    """of the picture before which it holds"""
+    t_ns: _builtins.int
+    """of that picture"""
+    setup_revision: _builtins.int
+    """in force; 0 before the first"""
+    json: _builtins.str
+    def __init__(
+        self,
+        *,
+        session: _builtins.int = ...,
+        seq: _builtins.int = ...,
+        t_ns: _builtins.int = ...,
+        setup_revision: _builtins.int = ...,
+        json: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["damage", b"damage", "frame_seq", b"frame_seq", "height_px", b"height_px", "patches", b"patches", "period_ns", b"period_ns", "scan", b"scan", "segment", b"segment", "setup_revision", b"setup_revision", "sigma_t_ns", b"sigma_t_ns", "stamp_ns", b"stamp_ns", "t_ns", b"t_ns", "utc_ns", b"utc_ns", "width_px", b"width_px"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["json", b"json", "seq", b"seq", "session", b"session", "setup_revision", b"setup_revision", "t_ns", b"t_ns"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
-Global___Pixels: _TypeAlias = Pixels  # noqa: Y015
+Global___Checkpoint: _TypeAlias = Checkpoint  # noqa: Y015
