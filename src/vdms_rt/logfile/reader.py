@@ -29,10 +29,18 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Channel, sequence, log time and publish time, before a message's data."""
 FOOTER_BYTES = HEAD.size + 20
 LARGEST_CHUNK_BYTES = 1 << 30
+LARGEST_RECORD_BYTES = 1 << 30
 SCAN_BYTES = 1 << 20
 ZSTD_MARK = b"\x04\x00\x00\x00zstd"
 ZSTD_MARK_OFFSET = HEAD.size + 8 + 8 + 8 + 4
 """Where the compression's name stands in a chunk record."""
+PLAIN: dict[int, type[Header | Schema | Channel | Metadata]] = {
+    Opcode.HEADER: Header,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+}
+"""Records without a checksum."""
 OPCODES = frozenset(int(opcode) for opcode in Opcode)
 UNREADABLE = (
     McapError,
@@ -158,14 +166,13 @@ class LogReader:
         if len(head) < HEAD.size:
             return None
         opcode, length = HEAD.unpack(head)
-        if opcode not in OPCODES or offset + HEAD.size + length > self.size_bytes:
+        if opcode not in OPCODES or length > LARGEST_RECORD_BYTES:
             return None
-        if opcode == Opcode.DATA_END and length != 4:
+        if offset + HEAD.size + length > self.size_bytes:
             return None
         content = self._file.read(length)
-        if opcode == Opcode.CHUNK and not _chunk_is_consistent(content):
-            return None
-        return Block(opcode, content, offset=offset)
+        # A record with a wrong length would take what follows with it.
+        return Block(opcode, content, offset=offset) if _is_consistent(opcode, content) else None
 
     def _find_chunk(self, offset: int) -> int:
         """Return where the next chunk begins, or the size of the file."""
@@ -194,13 +201,16 @@ class LogReader:
                 block.chunk = Chunk.read(stream)
                 self._parse_chunk(block, block.chunk)
             case Opcode.ATTACHMENT:
-                if zlib.crc32(content[:-4]) != int.from_bytes(content[-4:], "little"):
-                    raise McapError("the checksum of an attachment is wrong")
                 block.records.append(Attachment.read(stream))
             case Opcode.METADATA:
                 block.records.append(Metadata.read(stream))
             case Opcode.HEADER:
                 block.records.append(Header.read(stream))
+            case Opcode.SCHEMA | Opcode.CHANNEL:
+                # Those of the summary and of chunks have a checksum; these have none.
+                known = self._schemas if block.opcode == Opcode.SCHEMA else self._channels
+                if int.from_bytes(content[:2], "little") not in known:
+                    self._parse_inner(block, block.opcode, content, 0)
             case _:
                 self._parse_inner(block, block.opcode, content, 0)
 
@@ -267,6 +277,30 @@ class LogReader:
                     inner = summary[start : start + length]
                     self._parse_inner(Block(opcode, inner), opcode, inner, 0)
                 offset = start + length
+
+
+def _is_consistent(opcode: int, content: bytes) -> bool:
+    """Whether the lengths inside of a record agree with its own, and its checksum if it has one
+    outside of what it compresses."""
+    match opcode:
+        case Opcode.CHUNK:
+            return _chunk_is_consistent(content)
+        case Opcode.MESSAGE_INDEX:
+            return len(content) >= 6 and 6 + int.from_bytes(content[2:6], "little") == len(content)
+        case Opcode.ATTACHMENT:
+            return zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
+        case Opcode.DATA_END:
+            return len(content) == 4
+        case Opcode.MESSAGE:
+            return len(content) >= MESSAGE_HEAD.size
+        case Opcode.HEADER | Opcode.SCHEMA | Opcode.CHANNEL | Opcode.METADATA:
+            stream = ReadDataStream(BytesIO(content))
+            with contextlib.suppress(*UNREADABLE):
+                PLAIN[opcode].read(stream)
+                return stream.count == len(content)
+            return False
+        case _:  # of the summary
+            return False
 
 
 def _chunk_is_consistent(content: bytes) -> bool:
