@@ -10,7 +10,7 @@ from collections import Counter, deque
 from dataclasses import replace
 
 from vdms_rt import codec
-from vdms_rt.model import Displacement, Event, Frame, Health, Luma, Region, Severity, Truth
+from vdms_rt.model import Displacement, Event, Frame, Health, Luma, Picture, Region, Severity, Truth
 from vdms_rt.publish import Publisher
 from vdms_rt.record import Recorder
 from vdms_rt.report import set_up_report
@@ -129,6 +129,20 @@ class Outlet:
         self._say(topics.SETUP, "", self.now_ns(), message.SerializeToString())
         if self.recorder is not None:
             self.recorder.attach("reference.png", "image/png", codec.png(image))
+
+    def checkpoint(self, picture: Picture, revision: int, text: str) -> None:
+        """Log where measuring stands just before a picture."""
+        if self.recorder is None or self._patches == "none":
+            return
+        message = pb.Checkpoint(
+            session=self.session,
+            seq=picture.seq,
+            t_ns=picture.t_ns,
+            setup_revision=revision,
+            json=text,
+        )
+        at_ns = picture.utc_ns or picture.t_ns
+        self._say(topics.CHECKPOINT, "", at_ns, message.SerializeToString())
 
     def pixels(
         self,

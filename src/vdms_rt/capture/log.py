@@ -129,7 +129,8 @@ class LogSource:
             live=self._realtime,
             stamp_event=StampEvent.MID_EXPOSURE,
             sequence_counts_lost=True,
-            scan_known=scan is Scan.PROGRESSIVE,
+            scan_known=scan is Scan.PROGRESSIVE or pixels.order_known,
+            exposure_ns=pixels.exposure_ns if pixels.HasField("exposure_ns") else None,
             facts=(("file", str(self._path)), *self._facts),
         )
 

@@ -29,6 +29,7 @@ from vdms_rt.model import (
     State,
     Status,
 )
+from vdms_rt.process.checkpoint import checkpoint
 from vdms_rt.process.commands import ZERO_SAMPLES, Mailbox, changed, with_axes
 from vdms_rt.process.pictures import pictures
 from vdms_rt.process.progress import Phase, Plan, Progress
@@ -40,6 +41,9 @@ from vdms_rt.setup import SetUp, mismatch
 SEARCH_S = 0.5
 """Least time between two searches: they cost a quarter of a core at this pace."""
 TAKE_TIMEOUT_S = 0.2
+CHECKPOINT_NS = 1_000_000_000
+"""Between two checkpoints: the most that cannot be measured again with the same numbers from a
+file that begins in the middle of a run."""
 
 
 class Outlet(Protocol):
@@ -50,6 +54,8 @@ class Outlet(Protocol):
     def event(self, event: Event) -> None: ...
 
     def set_up(self, set_up: SetUp, image: Luma) -> None: ...
+
+    def checkpoint(self, picture: Picture, revision: int, text: str) -> None: ...
 
     def pixels(
         self, frame: Frame, regions: tuple[tuple[Region, ...], ...], revision: int
@@ -103,6 +109,7 @@ class Processor:
         self._search = search
         self._outlet = outlet
         self._progress: Progress | None = None
+        self._checkpoint_ns = 0
         self._asked_ns: int | None = None
         self._told_missing = False
         self._work = Workspace()
@@ -138,8 +145,10 @@ class Processor:
         for picture in pictures(frame, self._sampling, progress.order):
             if progress.searched:
                 progress = self._searched(progress, picture, stop)
+            self._keep(progress, picture)
             before = progress.set_up
             progress, samples, events = step(progress, picture, self._work)
+            self._progress = progress
             samples = zeroed(progress, samples)
             for sample in samples:
                 self._count(sample)
@@ -150,9 +159,17 @@ class Processor:
                 self._outlet.event(_at(event, picture))
         self._outlet.pixels(frame, progress.regions, progress.revision)
         self.counters.state = progress.state
-        self._progress = progress
         for look in looks:
             look.set_result(_snapshot(frame, progress, samples))
+
+    def _keep(self, progress: Progress, picture: Picture) -> None:
+        """Say where the run stands, before the picture is measured: after whatever else than a step
+        has changed it, and now and then while measuring."""
+        since_ns = picture.t_ns - self._checkpoint_ns
+        due = progress.phase in (Phase.MEASURING, Phase.STALE) and not 0 <= since_ns < CHECKPOINT_NS
+        if due or progress is not self._progress:
+            self._checkpoint_ns = picture.t_ns
+            self._outlet.checkpoint(picture, progress.revision, checkpoint(progress))
 
     def _commanded(
         self, progress: Progress, frame: Frame

@@ -133,6 +133,10 @@ class Progress:
     """For each marker; empty while searching."""
     set_up: SetUp | None = None
     watches: tuple[Watch, ...] = ()
+    exposure_ns: int = 0
+    """Of a field, as the watches take it."""
+    period_ns: int = 0
+    """Of a frame, as the watches take it."""
     revision: int = 0
     stills: tuple[Still, ...] = ()
     waiting: bool = False

@@ -60,6 +60,8 @@ def begin(
             phase=Phase.CHECKING,
             set_up=stored,
             watches=watches_of(stored, plan, exposure_ns, period_ns),
+            exposure_ns=exposure_ns,
+            period_ns=period_ns,
             revision=max(revision, stored.revision),
             regions=tuple(m.regions for m in stored.markers),
             order=stored.scan if stored.order_proved else None,

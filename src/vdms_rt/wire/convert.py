@@ -261,6 +261,8 @@ def pixels_bytes(
         utc_ns=frame.utc_ns,
         segment=frame.segment,
         period_ns=frame.period_ns,
+        exposure_ns=frame.exposure_ns,
+        order_known=frame.order_known,
         setup_revision=setup_revision,
         damage=int(frame.damage),
         width_px=width_px,

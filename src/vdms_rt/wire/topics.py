@@ -94,7 +94,17 @@ PIXELS = Topic(
     recorded=True,
 )
 
-TOPICS = (DISPLACEMENT, TRUTH, HEALTH, EVENT, SETUP, RUN, END, PIXELS)
+CHECKPOINT = Topic(
+    "checkpoint",
+    "vdms/{station}/checkpoint",
+    pb.Checkpoint,
+    "",
+    "1 Hz and on change",
+    network=False,
+    recorded=True,
+)
+
+TOPICS = (DISPLACEMENT, TRUTH, HEALTH, EVENT, SETUP, RUN, END, PIXELS, CHECKPOINT)
 
 ALIVE_KEY = "vdms/{station}/alive"
 """Liveliness token of a running daemon; it says that the process lives, not that it measures."""

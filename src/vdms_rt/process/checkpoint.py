@@ -1,0 +1,137 @@
+"""A run's standing between two pictures as text: from it, and the set-up, measuring goes on with
+the same numbers, bit for bit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from vdms_rt.measure.fieldorder import OrderEvidence
+from vdms_rt.measure.smooth import Slow
+from vdms_rt.model import Region, Scan, VdmsError
+from vdms_rt.process.progress import Phase, Plan, Progress, Still, watches_of
+from vdms_rt.process.track import Track
+from vdms_rt.setup import SetUp
+
+
+class CheckpointError(VdmsError):
+    """A recorded checkpoint cannot be used."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Watched:
+    """Of one marker, what does not follow from the set-up."""
+
+    slow: tuple[tuple[Scan, Slow], ...]
+    regions: tuple[Region, ...]
+    track: Track
+    lost_since_ns: int | None
+    relocated: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Checkpoint:
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(ser_json_inf_nan="constants")
+
+    plan: Plan
+    width_px: int
+    height_px: int
+    phase: Phase
+    regions: tuple[tuple[Region, ...], ...]
+    watched: tuple[_Watched, ...]
+    exposure_ns: int
+    period_ns: int
+    revision: int
+    stills: tuple[Still, ...]
+    waiting: bool
+    lost_since_ns: int | None
+    order: Scan | None
+    evidence: OrderEvidence
+    order_wrong: bool
+    has_set_up: bool
+
+
+_TEXT = TypeAdapter(_Checkpoint)
+
+
+def checkpoint(progress: Progress) -> str:
+    """Return all that a run knows besides its set-up, as JSON."""
+    value = _Checkpoint(
+        plan=progress.plan,
+        width_px=progress.width_px,
+        height_px=progress.height_px,
+        phase=progress.phase,
+        regions=progress.regions,
+        watched=tuple(
+            _Watched(
+                tuple(watch.slow.items()),
+                watch.regions,
+                watch.track,
+                watch.lost_since_ns,
+                watch.relocated,
+            )
+            for watch in progress.watches
+        ),
+        exposure_ns=progress.exposure_ns,
+        period_ns=progress.period_ns,
+        revision=progress.revision,
+        stills=progress.stills,
+        waiting=progress.waiting,
+        lost_since_ns=progress.lost_since_ns,
+        order=progress.order,
+        evidence=progress.evidence,
+        order_wrong=progress.order_wrong,
+        has_set_up=progress.set_up is not None,
+    )
+    return _TEXT.dump_json(value).decode()
+
+
+def resumed(text: str, set_up: SetUp | None, session: int) -> Progress:
+    """Return the run that `checkpoint` described; `set_up` was in force then.
+
+    Raises CheckpointError for a text that is none of this version, or whose set-up is missing.
+    """
+    try:
+        value = _TEXT.validate_json(text)
+    except ValidationError:
+        raise CheckpointError("a recorded checkpoint is not one of this version") from None
+    if value.has_set_up and set_up is None:
+        raise CheckpointError(
+            f"the set-up of revision {value.revision} stands in no readable part of the recording"
+        )
+    watches = (
+        watches_of(set_up, value.plan, value.exposure_ns, value.period_ns)
+        if set_up is not None and value.watched
+        else ()
+    )
+    return Progress(
+        plan=value.plan,
+        session=session,
+        width_px=value.width_px,
+        height_px=value.height_px,
+        phase=value.phase,
+        regions=value.regions,
+        set_up=set_up if value.has_set_up else None,
+        watches=tuple(
+            replace(
+                watch,
+                slow=dict(seen.slow),
+                regions=seen.regions,
+                track=seen.track,
+                lost_since_ns=seen.lost_since_ns,
+                relocated=seen.relocated,
+            )
+            for watch, seen in zip(watches, value.watched, strict=True)
+        ),
+        exposure_ns=value.exposure_ns,
+        period_ns=value.period_ns,
+        revision=value.revision,
+        stills=value.stills,
+        waiting=value.waiting,
+        lost_since_ns=value.lost_since_ns,
+        order=value.order,
+        evidence=value.evidence,
+        order_wrong=value.order_wrong,
+    )
