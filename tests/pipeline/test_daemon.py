@@ -249,16 +249,30 @@ def test_a_stored_set_up_is_confirmed_by_the_next_run(tmp_path: Path) -> None:
     assert "the stored set-up, revision 1, holds" in again.stderr
 
 
-def test_a_moved_camera_makes_the_stored_set_up_stale(tmp_path: Path) -> None:
-    config = table_config(tmp_path, table="[table.motion]\nkind = 'still'")
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ("roll_deg = 0.0", "roll_deg = 0.2", "moved by 0.3"),
+        ("angle_deg = 30.0", "angle_deg = 30.2", "moved by 0.1"),
+    ],
+)
+def test_a_camera_that_was_turned_makes_the_stored_set_up_stale(
+    tmp_path: Path, before: str, after: str, says: str
+) -> None:
+    config = table_config(tmp_path, table=f"{before}\n[table.motion]\nkind = 'still'")
     assert run("run", "--config", config, "--seconds", 4).returncode == 0
-    before = {p.name for p in (tmp_path / "recordings").iterdir()}
-    config.write_text(config.read_text().replace("stamp_jitter", "roll_deg = 1.0\nstamp_jitter"))
+    old = {p.name for p in (tmp_path / "recordings").iterdir()}
+    config.write_text(config.read_text().replace(before, after))
     again = run("run", "--config", config, "--seconds", 4)
-    assert "does not match the picture" in again.stderr
-    (path,) = [p for p in (tmp_path / "recordings").iterdir() if p.name not in before]
+    assert "the stored set-up does not match the picture: a marker's circles have" in again.stderr
+    assert says in again.stderr
+    assert "start with setup.load = false to take a new reference" in again.stderr
+    (path,) = [p for p in (tmp_path / "recordings").iterdir() if p.name not in old]
     samples = list(messages(path, "displacement"))
-    assert samples[-1].status & Status.SET_UP_STALE
+    checked = [bool(s.status & Status.SET_UP_STALE) for s in samples]
+    first = checked.index(True)
+    assert all(checked[first:])
+    assert all(s.status & Status.SET_UP for s in samples[:first])
     assert not any(s.valid for s in samples)
 
 

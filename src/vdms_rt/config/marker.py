@@ -77,6 +77,8 @@ class SetUpSection(Section):
     """The most that any circle may move, peak to peak, while the reference is taken."""
     stale_px: float = Field(default=0.5, gt=0, le=50)
     """The most that a stored reference may differ from fresh stills."""
+    turned_px: float = Field(default=0.1, gt=0, le=50)
+    """The most that a marker's circles may have moved against each other since."""
 
 
 class Process(Section):

@@ -54,6 +54,7 @@ class Plan:
     reference_pictures: int
     still_px: float
     stale_px: float
+    turned_px: float
     method: str
 
     @classmethod
@@ -66,6 +67,7 @@ class Plan:
             reference_pictures=config.setup.reference_pictures,
             still_px=config.setup.still_px,
             stale_px=config.setup.stale_px,
+            turned_px=config.setup.turned_px,
             method=config.process.method,
         )
 

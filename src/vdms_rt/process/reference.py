@@ -36,6 +36,9 @@ from vdms_rt.setup import FieldSetUp, MarkerSetUp, SetUp
 LOST_S = 1.0
 """A marker that is not in its regions for so long before the reference is searched anew."""
 
+NOISE_LIMIT = 4.0
+"""Standard deviations of the noise that do not count as a turned camera."""
+
 
 def gather(
     progress: Progress, picture: Picture, work: Workspace
@@ -131,21 +134,36 @@ def _checked(
     progress: Progress, by_kind: dict[Scan, list[Still]]
 ) -> tuple[Progress, tuple[Event, ...]]:
     assert progress.set_up is not None
+    set_up = progress.set_up
     now = np.mean([_centres(same).mean(axis=0) for same in by_kind.values()], axis=0)
-    reference = np.array([p for m in progress.set_up.markers for p in m.reference_px])
-    moved_px = float(np.abs(now - reference).max())
+    reference = np.array([p for m in set_up.markers for p in m.reference_px])
+    moved = now - reference
+    moved_px = float(np.abs(moved).max())
+    turned_px = 0.0
+    first = 0
+    for marker in set_up.markers:
+        own = moved[first : first + len(marker.regions)]
+        first += len(marker.regions)
+        turned_px = max(turned_px, float(np.abs(own - own.mean(axis=0)).max()))
+    noise = max(m.noise_px for m in set_up.markers)
+    noise *= math.sqrt(1 / set_up.stills + 1 / sum(map(len, by_kind.values())))
+    turned = turned_px > progress.plan.turned_px + NOISE_LIMIT * noise
     progress = dataclasses.replace(progress, stills=(), waiting=False)
-    if moved_px <= progress.plan.stale_px:
+    if moved_px <= progress.plan.stale_px and not turned:
         text = (
             f"the stored set-up, revision {progress.revision}, holds: "
             f"its circles are within {moved_px:.2f} px"
         )
         event = Event(Severity.INFO, "set-up-confirmed", text)
         return dataclasses.replace(progress, phase=Phase.MEASURING), (event,)
+    if turned:
+        what = f"a marker's circles have moved by {turned_px:.2f} px against each other"
+    else:
+        what = f"a circle is {moved_px:.1f} px off"
     text = (
-        f"the stored set-up does not match the picture: a circle is {moved_px:.1f} px off. The "
-        "camera or the marker was moved; put it back, or start with setup.load = false to take a "
-        "new reference"
+        f"the stored set-up does not match the picture: {what}. The camera or the marker was "
+        f"{'turned' if turned else 'moved'}; put it back, or start with setup.load = false to take "
+        "a new reference"
     )
     return (
         dataclasses.replace(progress, phase=Phase.STALE),
