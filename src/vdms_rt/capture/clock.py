@@ -39,11 +39,13 @@ class ClockFigures:
     jitter_us: float
     """Standard deviation of the driver's stamps about the frame clock."""
     sigma_us: float
-    """Of the latest time, a constant delay aside."""
+    """Of the latest time, as `Tick.sigma_t_ns`."""
     rate_ppm: float
     """Of the source against the computer's clock; positive when frames come fast."""
     missed: int
-    """Images that never came: frames, or fields of a source that alternates."""
+    """Images that never came while others did: frames, or fields of a source that alternates. The
+    time of a source that was off for over two seconds or opened anew is not among them, though
+    the index goes on with it; the event of the new segment tells how many it was."""
     segments: int
     settling: bool
     """Too few stamps so far for times at their best."""
@@ -79,6 +81,11 @@ class FrameClock:
     two of a frame get the same index and times half a period apart. An image's place on the grid
     is found from its stamp, as most drivers leave no gap in their sequence where they lose a frame.
     A recording's stamps are its times, untouched.
+
+    `Tick.sigma_t_ns` is the standard deviation of what the stamps' lateness leaves: of the time
+    against the earliest that the driver ever stamps (or, where its lateness has no sharp lower
+    edge, against a constant above that), from the first image on. What is constant in the chain is
+    not in it, as no stamp can show it: it shifts a record as a whole and bends nothing.
     """
 
     def __init__(
@@ -196,12 +203,12 @@ class FrameClock:
             return slot + max(1, round(gap_ns / self._period_ns))
         broken = self._broken(gap_ns, step)
         if broken:
+            # A source that was off or opened anew has missed nothing that it should have given.
             skipped = max(0, round(gap_ns / self._period_ns) - 1)
-            self._miss(slot, skipped)
             self._lately_missed.clear()
             slot += 1 + skipped
             self._restart([(slot, stamp_ns)])
-            self._jump(broken)
+            self._jump(broken, skipped)
             return slot
         if self._cadence.add(stamp_ns, step):
             verdict = self._cadence.judge(not self._free)
@@ -370,13 +377,14 @@ class FrameClock:
         error_ns = self._just_missed * self._period
         return error_ns * math.sqrt(self._taken_back / (self._calls + 1))
 
-    def _jump(self, why: str) -> None:
+    def _jump(self, why: str, without: int = 0) -> None:
+        """Begin a segment, `without` images of the time before it."""
         self._segment += 1
         self._tell(
             Severity.WARNING,
             "clock-jump",
             f"frame times begin segment {self._segment}: {why}",
-            (("segment", str(self._segment)),),
+            (("segment", str(self._segment)), ("without", str(without))),
         )
 
     def _tell_rate(self, rate: float) -> None:
