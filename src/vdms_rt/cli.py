@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import faulthandler
+import getpass
 import logging
 import math
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 
 import vdms_rt
 from vdms_rt.config import effective_values, load_config
+from vdms_rt import ctl
 from vdms_rt.console import Console, fault_text
 from vdms_rt.model import ConfigError, MarkerShape, VdmsError
 
@@ -20,8 +22,6 @@ EXIT_STOPPED = 0
 EXIT_FAILED = 1
 EXIT_CONFIG = 78
 """EX_CONFIG of sysexits.h; the service is not restarted on it."""
-
-DEFAULT_ADDRESS = "tcp/127.0.0.1:7447"
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -204,9 +204,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     verb.add_argument(
         "--connect",
-        default=DEFAULT_ADDRESS,
+        default=ctl.DEFAULT_ADDRESS,
         metavar="ADDRESS",
-        help=f"where the station listens (default: {DEFAULT_ADDRESS})",
+        help=f"where the station listens (default: {ctl.DEFAULT_ADDRESS})",
     )
     verb.add_argument("--csv", type=Path, metavar="FILE", help="write every sample to this file")
     verb.add_argument(
@@ -215,6 +215,43 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+
+    verb = _verb(
+        verbs,
+        "ctl",
+        ctl.run_ctl,
+        "ask a running station, or tell it what to do",
+        "What changes the measurement is applied between two frames; the answer names the first "
+        "sample that it affects. Exit status 1, with the reason, if the station refused.",
+    )
+    ctl.add_arguments(verb)
+
+    verb = _verb(
+        verbs,
+        "keys",
+        _keys,
+        "make keys or a password for controlling a station from elsewhere",
+        "By default only the station's own computer controls it. `keys server HOST...` makes a "
+        "certificate for the station, `keys client NAME` one for somebody who may control it, "
+        "`keys password NAME` lets somebody in by a password; each says what to do next.",
+    )
+    verb.add_argument("kind", choices=("server", "client", "password"))
+    verb.add_argument(
+        "names",
+        nargs="+",
+        metavar="NAME",
+        help="of the station's computer, and its addresses; or who may control",
+    )
+    verb.add_argument(
+        "--folder",
+        type=Path,
+        default=Path("keys"),
+        metavar="FOLDER",
+        help="where all of it is kept (default: keys)",
+    )
+    verb.add_argument(
+        "--ask", action="store_true", help="ask for the password instead of making one up"
+    )
 def _verb(
     verbs: Any, name: str, body: Callable[[argparse.Namespace], int], short: str, long: str
 ) -> argparse.ArgumentParser:
@@ -330,3 +367,18 @@ def _watch(arguments: argparse.Namespace) -> int:
     from vdms_rt.watch import run_watch
 
     return run_watch(arguments.connect, arguments.csv, seconds=arguments.seconds)
+def _keys(arguments: argparse.Namespace) -> int:
+    from vdms_rt import keys
+
+    if arguments.kind == "server":
+        print(keys.make_server(arguments.folder, arguments.names))
+        return EXIT_STOPPED
+    for name in arguments.names:
+        if arguments.kind == "client":
+            print(keys.make_client(arguments.folder, name))
+        else:
+            password = getpass.getpass(f"password for {name}: ") if arguments.ask else ""
+            print(keys.make_password(arguments.folder, name, password))
+    return EXIT_STOPPED
+
+

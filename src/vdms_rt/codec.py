@@ -31,6 +31,15 @@ def jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
     return _encoded(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
+def narrowed(image: Luma, most_width_px: int) -> Luma:
+    """Return the picture, made smaller if it is wider than `most_width_px` (0: as it is)."""
+    height_px, width_px = image.shape
+    if not 0 < most_width_px < width_px:
+        return image
+    size = most_width_px, max(round(height_px * most_width_px / width_px), 1)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def picture_from(data: bytes) -> Luma | None:
     """Return the luma (height, width) of a picture file's bytes, or None if they are not one."""
     decoded = decode_picture(data)

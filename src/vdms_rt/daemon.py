@@ -23,6 +23,8 @@ import vdms_rt
 from vdms_rt.capture.loop import Capture
 from vdms_rt.config import Config, effective_values, is_live
 from vdms_rt.console import Console
+from vdms_rt.control.desk import Desk
+from vdms_rt.control.server import ControlServer
 from vdms_rt.find import Search
 from vdms_rt.logfile.repair import repair_directory
 from vdms_rt.model import Displacement, Event, Health, Severity, State, VdmsError
@@ -66,6 +68,7 @@ class Daemon:
         self._kept: SetUp | None = None
         self._faults: list[BaseException] = []
         self._notifier = Notifier()
+        self._control: ControlServer | None = None
         self._fed: tuple[int, Displacement | None] = (0, None)
         self._started_s = time.monotonic()
         self._rates: deque[tuple[float, int]] = deque()
@@ -110,10 +113,13 @@ class Daemon:
                         sample_rate_hz=SAMPLE_RATE_HZ,
                     )
                 )
+                        control=self.config.control,
             if self.config.record.enabled:
                 self._outlet.recorder = self._recorder()
             threads = self._start()
             self._notifier.ready()
+            if self._outlet.publisher is not None and self.config.control.enabled:
+                self._control = sinks.enter_context(self._control_server(self._outlet.publisher))
             try:
                 self._supervise(seconds, threads["process"])
             finally:
@@ -135,16 +141,31 @@ class Daemon:
             log.warning(repaired.sentence)
         return recorder
 
+    def _control_server(self, publisher: Publisher) -> ControlServer:
+        desk = Desk(
+            station=self._outlet,
+            submit=self._processor.commands.submit,
+            markers=self.config.marker,
+            pixel_aspect=self.config.lens.pixel_aspect,
+            runs=self._outlet.recorder,
+            directory=Path(self.config.record.directory).expanduser(),
+        )
+        return ControlServer(
+            self.config.control, self.config.station.name, publisher.session, desk
+        )
+
+            "process": lambda: self._processor.run(self._stop),
+            "find": lambda: self._search.run(self._stop),
     def _start(self) -> dict[str, threading.Thread]:
         bodies: dict[str, Callable[[], None]] = {
             "capture": lambda: self._capture.run(self._stop),
-            "process": lambda: self._processor.run(self._stop),
-            "find": lambda: self._search.run(self._stop),
         }
         if self._outlet.recorder is not None:
             bodies["record"] = self._outlet.recorder.run
         threads = {
             name: threading.Thread(target=self._guarded, args=(body,), name=name)
+        if (control := self._control) is not None:
+            bodies["control"] = lambda: control.run(self._stop)
             for name, body in bodies.items()
         }
         for thread in threads.values():
@@ -207,8 +228,9 @@ class Daemon:
         self._ring.drop()
         if recorder is not None:
             recorder.hurry()
-        for name in ("process", "find"):
-            threads[name].join(max(0.0, deadline_s - time.monotonic()))
+        for name in ("process", "find", "control"):
+            if name in threads:
+                threads[name].join(max(0.0, deadline_s - time.monotonic()))
         self._keep_set_up()
         self._outlet.health(self._health())
         if recorder is not None:

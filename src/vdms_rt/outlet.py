@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import replace
 
 from vdms_rt import codec
@@ -29,6 +30,8 @@ LEVELS = {
 
 
 TOLD_OF_A_CODE = 3
+RECENT = 3600
+"""Samples of each marker that are kept for questions about the last minute."""
 
 
 class Outlet:
@@ -43,6 +46,9 @@ class Outlet:
         self.session = session
         self._markers = markers
         self.newest_set_up: SetUp | None = None
+        self.newest_set_up_message: pb.SetUp | None = None
+        self.newest_health: pb.Health | None = None
+        self._recent: dict[str, deque[Displacement]] = {m: deque(maxlen=RECENT) for m in markers}
         self._live = live
         self._patches = patches
         self._utc_offset_ns = time.time_ns() - time.monotonic_ns()
@@ -66,10 +72,15 @@ class Outlet:
             self._newest_ns,
             convert.displacement_bytes(sample),
         )
+        self._recent[sample.marker].append(sample)
         if self._live:
             with self._lock:
                 self._age_sum_ms += (time.monotonic_ns() - sample.t_ns) / 1e6
                 self._age_count += 1
+
+    def recent(self, marker: str) -> Sequence[Displacement]:
+        """Return a marker's last samples, the newest last; any thread may ask."""
+        return self._recent[marker].copy()
 
     def sample_age_ms(self) -> float:
         """Return the mean age of the samples since the last call, NaN without any."""
@@ -161,9 +172,8 @@ class Outlet:
 
     def health(self, health: Health) -> None:
         """Say how the daemon is."""
-        self._say(
-            topics.HEALTH, "", self.now_ns(), convert.health_message(health).SerializeToString()
-        )
+        self.newest_health = message = convert.health_message(health)
+        self._say(topics.HEALTH, "", self.now_ns(), message.SerializeToString())
 
     def _say(self, topic: Topic, marker: str, at_ns: int, data: bytes) -> None:
         if topic.network and self.publisher is not None:

@@ -13,64 +13,15 @@ from typing import Any, Self
 import zenoh
 from zenoh import ext
 
-from vdms_rt.config import Publish
+from vdms_rt.config import Control, Publish
 from vdms_rt.model import VdmsError
+from vdms_rt.wire.access import BY_CERTIFICATE, EVERYONE, THIS_COMPUTER, access
+from vdms_rt.wire.keys import KeysError, server_tls
 from vdms_rt.wire.session import SESSION, endpoint_fault, reason
 from vdms_rt.wire.topics import ALIVE_KEY, TOPICS, Topic
 
 HEARTBEAT_S = 0.5
 """How often a subscriber learns the newest number, so that it misses even the last sample."""
-
-_OURS = "vdms/**"
-_RECOVERY = "vdms/**/@adv/**"
-"""Where zenoh's advanced publishers keep history and heartbeats: `**` never crosses an `@`."""
-
-_ACCESS: dict[str, Any] = {
-    "enabled": True,
-    "default_permission": "deny",
-    "rules": [
-        {
-            "id": "ask for samples",
-            "permission": "allow",
-            "flows": ["ingress"],
-            "messages": [
-                "declare_subscriber",
-                "declare_liveliness_subscriber",
-                "liveliness_query",
-            ],
-            "key_exprs": [_OURS, _RECOVERY],
-        },
-        {
-            "id": "ask for history",
-            "permission": "allow",
-            "flows": ["ingress"],
-            "messages": ["query"],
-            "key_exprs": [_RECOVERY],
-        },
-        {
-            "id": "offer history",
-            "permission": "allow",
-            "flows": ["egress"],
-            "messages": ["declare_queryable"],
-            "key_exprs": [_RECOVERY],
-        },
-        {
-            "id": "tell",
-            "permission": "allow",
-            "flows": ["egress"],
-            "messages": ["put", "delete", "reply", "liveliness_token"],
-            "key_exprs": [_OURS, _RECOVERY],
-        },
-    ],
-    "subjects": [{"id": "everyone"}],
-    "policies": [
-        {
-            "rules": ["ask for samples", "ask for history", "offer history", "tell"],
-            "subjects": ["everyone"],
-        }
-    ],
-}
-"""A reader may subscribe and ask for history. Nobody but the station puts on its keys."""
 
 
 class PublishError(VdmsError):
@@ -87,14 +38,24 @@ class Publisher:
     """
 
     def __init__(
-        self, config: Publish, station: str, markers: Sequence[str], *, sample_rate_hz: float
+        self,
+        config: Publish,
+        station: str,
+        markers: Sequence[str],
+        *,
+        sample_rate_hz: float,
+        control: Control | None = None,
     ) -> None:
-        """`sample_rate_hz` is of each marker's samples and sizes the history."""
+        """`sample_rate_hz` is of each marker's samples and sizes the history; `control` says who
+        may send requests through this session (None: nobody)."""
         self._config = config
+        self._control = control or Control(enabled=False)
         self._station = station
         self._markers = tuple(markers)
         self._history = math.ceil(sample_rate_hz * config.recover_s) + 1
         self._listen = config.listen if config.mode == "peer" else ()
+        if self._control.enabled:
+            self._listen += self._control.listen
         self._session: zenoh.Session | None = None
         self._publishers: dict[tuple[str, str], zenoh.Publisher | ext.AdvancedPublisher] = {}
         self._unsent = 0
@@ -128,6 +89,12 @@ class Publisher:
         self._close.close()
 
     @property
+    def session(self) -> zenoh.Session:
+        """The session, open from `__enter__` to `__exit__`."""
+        assert self._session is not None
+        return self._session
+
+    @property
     def unsent(self) -> int:
         """Messages that the session refused."""
         return self._unsent
@@ -159,10 +126,14 @@ class Publisher:
         return True
 
     def _settings(self) -> zenoh.Config:
-        for key, endpoints in (("listen", self._listen), ("connect", self._config.connect)):
+        for key, endpoints in (
+            ("publish.listen", self._config.listen),
+            ("publish.connect", self._config.connect),
+            ("control.listen", self._control.listen),
+        ):
             for endpoint in endpoints:
                 if fault := endpoint_fault(endpoint):
-                    raise PublishError(f"publish.{key}: {fault}")
+                    raise PublishError(f"{key}: {fault}")
         config = zenoh.Config()
         # A zenoh client would refuse to start without its router; a peer that does not listen
         # is the same to the router and dials for ever.
@@ -177,10 +148,28 @@ class Publisher:
             "transport/link/tx/queue/size/data_high": 16,
             "transport/link/tx/queue/size/data": 16,
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
-            "access_control": _ACCESS,
+            "access_control": access(self._controllers()),
+            **self._tls(),
         }.items():
             config.insert_json5(name, json.dumps(value))
         return config
+
+    def _controllers(self) -> list[dict[str, Any]]:
+        if not self._control.enabled:
+            return []
+        if self._control.through_router:
+            return [EVERYONE]
+        # In mode "client" what comes through the loopback interface comes from a router.
+        here = [THIS_COMPUTER] if self._config.mode == "peer" else []
+        return [*here, BY_CERTIFICATE] if self._control.listen else here
+
+    def _tls(self) -> dict[str, Any]:
+        if not (self._control.enabled and self._control.listen):
+            return {}
+        try:
+            return {"transport/link/tls": server_tls(self._control.keys)}
+        except KeysError as error:
+            raise PublishError(f"control.keys: {error}") from None
 
     def _cannot_open(self, why: str) -> str:
         named = [e for e in self._listen if e.split("/", 1)[1] in why]
@@ -188,7 +177,7 @@ class Publisher:
         if "Address already in use" in why:
             return (
                 f"publish: {where} is in use; is another vdms-rt running? "
-                "Stop it, or set publish.listen to another port"
+                f"Stop it, or set {self._key(named)} to another port"
             )
         if "Cannot assign requested address" in why:
             return (
@@ -196,6 +185,11 @@ class Publisher:
                 'to one that is, or to "tcp/0.0.0.0:7447" for all of them'
             )
         return f"publish: cannot open {where}: {why}; correct publish.listen or publish.connect"
+
+    def _key(self, endpoints: Sequence[str]) -> str:
+        """Return the configuration's key of listening addresses."""
+        of_control = set(endpoints) & set(self._control.listen)
+        return "control.listen" if of_control else "publish.listen"
 
     def _declare(self, topic: Topic, key: str) -> zenoh.Publisher | ext.AdvancedPublisher:
         assert self._session is not None

@@ -79,7 +79,9 @@ class Recorder:
         self._run_end = run_end
         self._report = report
         self._directory = Path(config.directory).expanduser()
-        self._name = f"{station}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+        self._run = ""
+        self._name = self._file_name()
+        self._cut = ""
         self._backlog = Backlog(config.queue_messages, live)
 
         self._lock = threading.Lock()
@@ -116,6 +118,21 @@ class Recorder:
         One of the same name takes the place of the one before.
         """
         self._backlog.attach(LogAttachment(name, media_type, time.time_ns(), data))
+
+    @property
+    def run_name(self) -> str:
+        """The name of the run that somebody started, or empty."""
+        return self._run
+
+    def start_run(self, name: str) -> None:
+        """Record from now on into files of their own, which carry the name of a run."""
+        with self._lock:
+            self._run, self._cut = name, f"run {name} begins in a file of its own"
+
+    def stop_run(self) -> None:
+        """End the run's file; what comes goes into files without a name."""
+        with self._lock:
+            self._run, self._cut = "", f"end of run {self._run}"
 
     def hurry(self) -> None:
         """From now on nobody waits in `put`."""
@@ -238,6 +255,8 @@ class Recorder:
 
     def _full(self, log: LogWriter) -> str:
         """Return why what comes next belongs into the next file, or nothing."""
+        if self._cut:
+            return self._cut
         if time.monotonic() - self._part_opened_s >= self._config.rotate_s:
             return f"continued in the next file after {self._config.rotate_s:g} s"
         if log.length >= self._config.rotate_mb * 1e6:
@@ -247,6 +266,9 @@ class Recorder:
     def _open(self) -> LogWriter:
         """Return the next file, with all at its head that makes it readable alone."""
         self._directory.mkdir(parents=True, exist_ok=True)
+        with self._lock:
+            if self._cut:
+                self._cut, self._name, self._part = "", self._file_name(), 0
         log = self._create()
         self._log_time_ns = self._backlog.first_log_time_ns(self._log_time_ns)
         header = self._run_header()
@@ -265,6 +287,10 @@ class Recorder:
         )
         return log
 
+    def _file_name(self) -> str:
+        named = f"_{self._run}" if self._run else ""
+        return f"{self._station}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}{named}"
+
     def _create(self) -> LogWriter:
         part = self._part
         while True:
@@ -282,6 +308,7 @@ class Recorder:
             "version": run.version,
             "station": run.station,
             "session": f"{run.session:016x}",
+            "run": self._run,
             "part": str(self._part),
         }
 

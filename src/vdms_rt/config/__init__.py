@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_va
 from vdms_rt.config.base import Name, Section
 from vdms_rt.config.camera import Camera, Lens, lens_of_file
 from vdms_rt.config.marker import Marker, Process, SetUpSection
-from vdms_rt.config.sinks import Publish, Record
+from vdms_rt.config.sinks import Control, Publish, Record
 from vdms_rt.config.sources import Clip, Log, V4l2
 from vdms_rt.config.table import Motion, Table, TableSheet
 from vdms_rt.config.wording import key_of, rule
@@ -24,6 +24,7 @@ __all__ = [
     "Camera",
     "Clip",
     "Config",
+    "Control",
     "Lens",
     "Log",
     "Marker",
@@ -60,6 +61,7 @@ class Config(Section):
     setup: SetUpSection = SetUpSection()
     process: Process = Process()
     publish: Publish = Publish()
+    control: Control = Control()
     record: Record = Record()
 
     @model_validator(mode="after")
@@ -80,6 +82,11 @@ class Config(Section):
         if self.publish.mode == "client" and not self.publish.connect:
             raise ValueError(
                 'publish.mode = "client" needs publish.connect, the address of a router'
+            )
+        if self.control.through_router and self.publish.mode != "client":
+            raise ValueError(
+                'control.through_router needs publish.mode = "client": a station that listens '
+                "itself would let everyone control who reaches it"
             )
         return self
 

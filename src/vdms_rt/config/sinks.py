@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from vdms_rt.config.base import Section
 
@@ -17,6 +17,33 @@ class Publish(Section):
     connect: tuple[str, ...] = ()
     recover_s: float = Field(default=60.0, ge=1, le=600)
     """How long samples are kept for subscribers whose link was down."""
+
+
+class Control(Section):
+    enabled: bool = True
+    """Take requests from this computer, and from elsewhere where that is set up below."""
+    listen: tuple[str, ...] = ()
+    """For whoever shows a certificate: tls addresses, with `keys`."""
+    keys: str = ""
+    """Folder that `vdms-rt keys server` made."""
+    password_listen: tuple[str, ...] = ()
+    """For whoever knows a name and password of `users`."""
+    users: str = ""
+    """File that `vdms-rt keys password` made: a line name:password for each."""
+    through_router: bool = False
+    """Whoever reaches a router of publish.connect may control."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Control:
+        for name, kept in (("listen", "keys"), ("password_listen", "users")):
+            if getattr(self, name) and not getattr(self, kept):
+                raise ValueError(f"{name} needs {kept}; `vdms-rt keys --help` tells how to make it")
+        if others := [e for e in self.listen if not e.startswith(("tls/", "quic/"))]:
+            raise ValueError(
+                f'listen = "{others[0]}": only tls asks for a certificate; '
+                'write for example "tls/0.0.0.0:7448"'
+            )
+        return self
 
 
 class Record(Section):

@@ -404,6 +404,7 @@ class Answer(_message.Message):
     applied: _builtins.bool
     """it changes the samples from `seq` of `session` on"""
     seq: _builtins.int
+    """the first picture that it affects; of a mark, the newest one"""
     session: _builtins.int
     @_builtins.property
     def status(self) -> Global___Status: ...
@@ -446,7 +447,6 @@ class Status(_message.Message):
     SET_UP_FIELD_NUMBER: _builtins.int
     VERSION_FIELD_NUMBER: _builtins.int
     RUN_FIELD_NUMBER: _builtins.int
-    REGIONS_FIELD_NUMBER: _builtins.int
     version: _builtins.str
     run: _builtins.str
     """name of the run that is recorded, or empty"""
@@ -456,8 +456,6 @@ class Status(_message.Message):
     def set_up(self) -> _vdms_pb2.SetUp:
         """absent before the first"""
 
-    @_builtins.property
-    def regions(self) -> _containers.RepeatedCompositeFieldContainer[Global___MarkerRegions]: ...
     def __init__(
         self,
         *,
@@ -465,11 +463,10 @@ class Status(_message.Message):
         set_up: _vdms_pb2.SetUp | None = ...,
         version: _builtins.str = ...,
         run: _builtins.str = ...,
-        regions: _abc.Iterable[Global___MarkerRegions] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["health", b"health", "set_up", b"set_up"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["health", b"health", "regions", b"regions", "run", b"run", "set_up", b"set_up", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["health", b"health", "run", b"run", "set_up", b"set_up", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -560,8 +557,8 @@ class MarkerSeen(_message.Message):
         """its sample of this picture, if there is one"""
 
     @_builtins.property
-    def aim(self) -> _containers.RepeatedCompositeFieldContainer[Global___Aim]:
-        """how well the camera is aimed at it"""
+    def aim(self) -> _vdms_pb2.Aim:
+        """how the camera sees it, where it is seen"""
 
     def __init__(
         self,
@@ -569,50 +566,15 @@ class MarkerSeen(_message.Message):
         marker: _builtins.str = ...,
         regions: _abc.Iterable[Global___Rectangle] | None = ...,
         newest: _vdms_pb2.Displacement | None = ...,
-        aim: _abc.Iterable[Global___Aim] | None = ...,
+        aim: _vdms_pb2.Aim | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["newest", b"newest"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["aim", b"aim", "newest", b"newest"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
     _ClearFieldArgType: _TypeAlias = _typing.Literal["aim", b"aim", "marker", b"marker", "newest", b"newest", "regions", b"regions"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___MarkerSeen: _TypeAlias = MarkerSeen  # noqa: Y015
-
-@_typing.final
-class Aim(_message.Message):
-    """One thing to look at while the camera is set up."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    NAME_FIELD_NUMBER: _builtins.int
-    VALUE_FIELD_NUMBER: _builtins.int
-    UNIT_FIELD_NUMBER: _builtins.int
-    GOOD_FIELD_NUMBER: _builtins.int
-    TEXT_FIELD_NUMBER: _builtins.int
-    name: _builtins.str
-    """"focus", "exposure", "tilt", ..."""
-    value: _builtins.float
-    unit: _builtins.str
-    good: _builtins.bool
-    text: _builtins.str
-    """what it is, and what to do about it"""
-    def __init__(
-        self,
-        *,
-        name: _builtins.str = ...,
-        value: _builtins.float = ...,
-        unit: _builtins.str = ...,
-        good: _builtins.bool = ...,
-        text: _builtins.str = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["good", b"good", "name", b"name", "text", b"text", "unit", b"unit", "value", b"value"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___Aim: _TypeAlias = Aim  # noqa: Y015
 
 @_typing.final
 class Recording(_message.Message):
