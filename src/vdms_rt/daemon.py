@@ -111,15 +111,15 @@ class Daemon:
                         self.config.station.name,
                         self._names,
                         sample_rate_hz=SAMPLE_RATE_HZ,
+                        control=self.config.control,
                     )
                 )
-                        control=self.config.control,
             if self.config.record.enabled:
                 self._outlet.recorder = self._recorder()
-            threads = self._start()
-            self._notifier.ready()
             if self._outlet.publisher is not None and self.config.control.enabled:
                 self._control = sinks.enter_context(self._control_server(self._outlet.publisher))
+            threads = self._start()
+            self._notifier.ready()
             try:
                 self._supervise(seconds, threads["process"])
             finally:
@@ -154,18 +154,18 @@ class Daemon:
             self.config.control, self.config.station.name, publisher.session, desk
         )
 
-            "process": lambda: self._processor.run(self._stop),
-            "find": lambda: self._search.run(self._stop),
     def _start(self) -> dict[str, threading.Thread]:
         bodies: dict[str, Callable[[], None]] = {
             "capture": lambda: self._capture.run(self._stop),
+            "process": lambda: self._processor.run(self._stop),
+            "find": lambda: self._search.run(self._stop),
         }
         if self._outlet.recorder is not None:
             bodies["record"] = self._outlet.recorder.run
-        threads = {
-            name: threading.Thread(target=self._guarded, args=(body,), name=name)
         if (control := self._control) is not None:
             bodies["control"] = lambda: control.run(self._stop)
+        threads = {
+            name: threading.Thread(target=self._guarded, args=(body,), name=name)
             for name, body in bodies.items()
         }
         for thread in threads.values():
