@@ -1,4 +1,4 @@
-"""Finding the marker in a picture or clip for a person: its regions, and a drawing."""
+"""Finding the marker in a picture or clip for a person: its regions, a drawing, and what to do."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ import numpy as np
 
 from vdms_rt import codec
 from vdms_rt.capture.clip import ClipSource
-from vdms_rt.config import Clip, Config
+from vdms_rt.config import Clip, Config, Marker
+from vdms_rt.measure.aim import aim
+from vdms_rt.measure.gate import Workspace
 from vdms_rt.measure.marker import find_markers
 from vdms_rt.measure.regions import regions_around
 from vdms_rt.model import FoundMarker, Luma, Region, Scan, SourceError, VdmsError
+from vdms_rt.report import SCAN_WORDS, aim_lines
 
 
 class LookError(VdmsError):
@@ -30,10 +33,12 @@ def look(path: Path, config: Config, out: Path) -> tuple[str, bool]:
     found = {m.name: m for m in find_markers(image, shapes, scan)}
     missing = [s.name for s in shapes if s.name not in found]
     regions = {n: regions_around(m, by_name[n], width_px, height_px) for n, m in found.items()}
-    lines = [f"# {path}: {width_px} x {height_px} px, {scan.name.lower().replace('_', ' ')}"]
+    lines = [f"# {path}: {width_px} x {height_px} px, {SCAN_WORDS[scan]}"]
     for marker in config.marker:
         if marker.name not in found:
             continue
+        lines.append(f"# marker {marker.name}")
+        lines += [f"# {line}" for line in _aimed(image, scan, found[marker.name], marker, config)]
         rows = ",\n".join(
             f"  [{r.x_px}, {r.y_px}, {r.width_px}, {r.height_px}]" for r in regions[marker.name]
         )
@@ -56,6 +61,25 @@ def look(path: Path, config: Config, out: Path) -> tuple[str, bool]:
     _write(out, _drawn(image, found, regions))
     lines.append(f"# drawn in {out}")
     return "\n".join(lines), not missing
+
+
+def _aimed(
+    image: Luma, scan: Scan, found: FoundMarker, marker: Marker, config: Config
+) -> list[str]:
+    """Return how well the camera sees a marker, in the first picture that would be measured."""
+    step = 2 if scan.interlaced and config.process.sampling != "frame" else 1
+    seen = aim(
+        image[::step],
+        0,
+        step,
+        image.shape[0],
+        marker.shape,
+        found.centres_px,
+        found.semi_axes_px,
+        config.lens.pixel_aspect,
+        Workspace(),
+    )
+    return aim_lines(seen)
 
 
 def _first_picture(path: Path, clip: Clip) -> tuple[Luma, Scan]:
