@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import vdms_rt
-from vdms_rt.config import effective_values, load_config
 from vdms_rt import ctl
+from vdms_rt.config import effective_values, load_config
 from vdms_rt.console import Console, fault_text
 from vdms_rt.model import ConfigError, MarkerShape, VdmsError
 
@@ -212,9 +212,6 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument(
         "--seconds", type=_seconds, default=0.0, metavar="N", help="end after N seconds"
     )
-    return parser
-
-
 
     verb = _verb(
         verbs,
@@ -252,6 +249,9 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument(
         "--ask", action="store_true", help="ask for the password instead of making one up"
     )
+    return parser
+
+
 def _verb(
     verbs: Any, name: str, body: Callable[[argparse.Namespace], int], short: str, long: str
 ) -> argparse.ArgumentParser:
@@ -363,10 +363,6 @@ def _stroke(arguments: argparse.Namespace) -> int:
     return EXIT_STOPPED
 
 
-def _watch(arguments: argparse.Namespace) -> int:
-    from vdms_rt.watch import run_watch
-
-    return run_watch(arguments.connect, arguments.csv, seconds=arguments.seconds)
 def _keys(arguments: argparse.Namespace) -> int:
     from vdms_rt import keys
 
@@ -382,3 +378,7 @@ def _keys(arguments: argparse.Namespace) -> int:
     return EXIT_STOPPED
 
 
+def _watch(arguments: argparse.Namespace) -> int:
+    from vdms_rt.watch import run_watch
+
+    return run_watch(arguments.connect, arguments.csv, seconds=arguments.seconds)
