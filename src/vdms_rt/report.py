@@ -67,10 +67,10 @@ def _angle(aim: Aim) -> str:
         return f"straight on, within {aim.angle_deg + aim.angle_error_deg:.0f} deg"
     side = "one side"
     if aim.side_known:
-        side = "the right side" if aim.turn_deg > 0 else "the left side"
+        side = "right side" if aim.turn_deg > 0 else "left side"
     return (
-        f"{aim.angle_deg:.1f} +- {aim.angle_error_deg:.1f} deg; about the vertical "
-        f"{abs(aim.turn_deg):.1f}, {side} farther"
+        f"{aim.angle_deg:.1f} +- {aim.angle_error_deg:.1f} deg "
+        f"({abs(aim.turn_deg):.1f} about the vertical, {side} farther)"
     )
 
 

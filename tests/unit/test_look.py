@@ -30,9 +30,9 @@ def test_the_picture_is_told_with_its_figures_and_what_to_do(tmp_path: Path) -> 
     assert words["scale"].startswith("1.35")
     assert words["scale"].endswith(" up")
     assert words["angle"].startswith(("30.0 +- 1.0", "29.9 +- 1.0", "30.1 +- 1.0"))
-    assert words["angle"].endswith("the right side farther")
+    assert words["angle"].endswith("about the vertical, right side farther)")
     assert words["roll"] == "5.0 deg counter-clockwise"
-    assert words["focus"].startswith("a little soft: edges 1.5")
+    assert words["focus"].startswith("a little soft: edges 1.4")
     assert "% saturated" in words["exposure"]
     assert words["resolution"].startswith("at best ")
     assert words["to do"].startswith("turn the iris down: ")
