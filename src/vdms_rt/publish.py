@@ -45,11 +45,14 @@ class Publisher:
         *,
         sample_rate_hz: float,
         control: Control | None = None,
+        beside: Publisher | None = None,
     ) -> None:
         """`sample_rate_hz` is of each marker's samples and sizes the history; `control` says who
-        may send requests through this session (None: nobody)."""
+        may send requests through this session (None: nobody); `beside` is another station's, whose
+        session serves this one too."""
         self._config = config
         self._control = control or Control(enabled=False)
+        self._beside = beside
         self._station = station
         self._markers = tuple(markers)
         self._history = math.ceil(sample_rate_hz * config.recover_s) + 1
@@ -66,7 +69,11 @@ class Publisher:
         settings = self._settings()
         with contextlib.ExitStack() as stack:
             try:
-                self._session = stack.enter_context(zenoh.open(settings))
+                self._session = (
+                    self._beside.session
+                    if self._beside is not None
+                    else stack.enter_context(zenoh.open(settings))
+                )
             except zenoh.ZError as error:
                 raise PublishError(self._cannot_open(reason(error))) from None
             for topic in TOPICS:

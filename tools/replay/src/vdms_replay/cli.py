@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 import vdms_replay
-from vdms_replay import compare, export, info, recover
+from vdms_replay import compare, export, info, play, recover
 from vdms_rt.model import VdmsError
 
 EXIT_DONE = 0
@@ -19,6 +19,7 @@ EXIT_INTERRUPTED = 128 + signal.SIGINT
 VERBS = (
     info,
     recover,
+    play,
     export,
     compare,
 )
