@@ -28,7 +28,8 @@ def set_up_report(set_up: SetUp) -> str:
         f"{SCAN_WORDS[set_up.scan]}, method {set_up.method}"
     ]
     for marker in set_up.markers:
-        lines.append(f"marker {marker.shape.name}{' (fixed)' if marker.shape.fixed else ''}")
+        role = ": its motion is taken off the others" if marker.shape.fixed else ""
+        lines.append(f"marker {marker.shape.name}{role}")
         if marker.aim is not None:
             lines += aim_lines(marker.aim)
     return "\n".join(lines)

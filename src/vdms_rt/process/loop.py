@@ -83,6 +83,7 @@ class ProcessCounters:
     measured: int = 0
     invalid: int = 0
     newest: Displacement | None = None
+    """Of the first marker that moves."""
 
 
 class Processor:
@@ -101,6 +102,8 @@ class Processor:
     ) -> None:
         self.counters = ProcessCounters()
         self._plan = Plan.of(config)
+        names = [s.name for s in self._plan.shapes if not s.fixed] or [self._plan.shapes[0].name]
+        self._shown = names[0]
         self._sampling = config.process.sampling
         self._session = session
         self._stored = stored and with_axes(stored, self._plan.axes_deg)
@@ -252,7 +255,8 @@ class Processor:
             self.counters.measured += 1
         elif not sample.status & Status.SET_UP:
             self.counters.invalid += 1
-        self.counters.newest = sample
+        if sample.marker == self._shown:
+            self.counters.newest = sample
         self._recent[sample.marker].append(sample)
 
 
