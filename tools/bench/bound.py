@@ -8,6 +8,7 @@ pixel is sigma^2 + 1/12: its noise and its rounding to whole grey levels.
 from __future__ import annotations
 
 import argparse
+from functools import lru_cache
 from math import sqrt
 
 import numpy as np
@@ -20,16 +21,20 @@ _STEPS = ((0.05, 0, 0), (0, 0.05, 0), (0, 0, 0.5))
 
 
 def bound(bench: Bench, noise_grey: float, rows: slice = slice(None)) -> NDArray[np.float64]:
-    """Return the least standard deviations of x_mm, y_mm and rotation_mrad, (3,), from the `rows`
-    of one picture."""
+    """Return the least covariance of x_mm, y_mm and rotation_mrad, (3, 3), from the `rows` of one
+    picture."""
+    return _inverse_information(bench, rows.start, rows.step) * (noise_grey**2 + 1 / 12)
+
+
+@lru_cache(maxsize=64)
+def _inverse_information(bench: Bench, first: int | None, step: int | None) -> NDArray[np.float64]:
     slopes = []
-    for step in _STEPS:
-        ahead = bench.still(*step)[rows]
-        behind = bench.still(*(-s for s in step))[rows]
-        slopes.append(((ahead - behind) / (2 * sum(step))).ravel())
+    for move in _STEPS:
+        ahead = bench.still(*move)[first::step]
+        behind = bench.still(*(-s for s in move))[first::step]
+        slopes.append(((ahead - behind) / (2 * sum(move))).ravel())
     jacobian = np.array(slopes)
-    information = jacobian @ jacobian.T / (noise_grey**2 + 1 / 12)
-    return np.sqrt(np.diag(np.linalg.inv(information)))
+    return np.linalg.inv(jacobian @ jacobian.T)
 
 
 def error_percent(sigma_mm: float, amplitude_mm: float) -> float:
@@ -46,7 +51,7 @@ def main() -> None:
     print("distance_m  angle_deg  x_um   y_um   rotation_urad  Eq.3.1_at_10_mm_percent")
     for distance in DISTANCES_M:
         for angle in ANGLES_DEG:
-            x, y, turn = bound(Bench(distance, angle), args.noise_grey, rows)
+            x, y, turn = np.sqrt(np.diag(bound(Bench(distance, angle), args.noise_grey, rows)))
             print(
                 f"{distance:10g} {angle:10g} {x * 1000:6.3f} {y * 1000:6.3f} {turn * 1000:10.3f}"
                 f" {error_percent(x, 10):15.4f}"

@@ -1,7 +1,5 @@
 """What disturbs a disc, through the real process stage: how wrong the marker gets, and whether it
-says so.
-
-    .venv/bin/python -m tools.bench.disturbance [--trials 150] [--sampling field] [--csv FILE]
+says so. `python -m tools.bench.accuracy --set disturbed` runs it.
 
 The bench's marker (8 m, 30 deg, noise of 2 grey levels) swings by 10 mm at 1 Hz. In each trial one
 disc is hit, for three frames, by a disturbance that goes with it; `gradient on all` is light that
@@ -11,32 +9,26 @@ a status or one of its circles has a flag; what comes without a position is lost
 
 from __future__ import annotations
 
-import argparse
-import csv
-import sys
-from dataclasses import asdict, dataclass
-from pathlib import Path
+import itertools
+import multiprocessing
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress as Bar
+from rich.progress import track
 from rich.table import Table
 
-from tools.bench.picture import DISTURBANCES, Bench, Grey, disturbed, grabbed, woven
-from vdms_rt.config import parse_config
-from vdms_rt.measure.gate import Workspace
-from vdms_rt.measure.marker import find_markers
-from vdms_rt.model import Damage, Displacement, Frame, Scan
-from vdms_rt.process.pictures import pictures
-from vdms_rt.process.progress import Phase, Plan, Progress
-from vdms_rt.process.step import begin, found, step
+from tools.bench.film import Film, Picture, Way
+from tools.bench.picture import DISTURBANCES, Bench, Grey, disturbed
+from tools.bench.stage import PERIOD_NS, Stage, field_offsets_s, flagged
+from vdms_rt.model import Displacement
 
-PERIOD_NS = 33_366_667
-CYCLE = 30
-"""Frames in a period of the motion: so many clean pictures are drawn."""
+BENCH = Bench(distance_m=8.0, angle_deg=30.0)
 AMPLITUDE_MM = 10.0
-STILLS = 30
+NOISE_GREY = 2.0
 TRIALS_OF_A_REFERENCE = 10
 HIT_FRAMES = 3
 ALL = "gradient on all"
@@ -45,7 +37,10 @@ KINDS = (*DISTURBANCES, ALL)
 
 @dataclass(frozen=True)
 class Row:
+    """One line of the table."""
+
     kind: str
+    sampling: str
     trials: int
     samples: int
     rms_x_um: float
@@ -54,168 +49,152 @@ class Row:
     """Of x and y."""
     lost_percent: float
     flagged_percent: float
-    beyond_4_sigma: int
-    """Errors of x or y, in all valid samples."""
-    unflagged_beyond_4_sigma: int
-    within_2_sigma: float
     all_used_percent: float
     """Samples with a position from all four discs, a hit one by the rest of its edge."""
+    beyond_4_sigma: int
+    """Samples with an error of x or y beyond four of its sigmas."""
+    silent_beyond_4_sigma: int
+    """Those among them that are not flagged."""
+    within_2_sigma: float
+    seed: int
 
 
-class Stage:
-    """The process stage with the bench's marker before it."""
+class Swing:
+    """The marker before the process stage: at rest for the reference, then in harmonic motion."""
 
-    def __init__(self, bench: Bench, sampling: str, noise_grey: float, seed: int) -> None:
-        self.bench, self.sampling, self.noise_grey = bench, sampling, noise_grey
-        self.rng = np.random.default_rng(seed)
-        self.work = Workspace()
-        fields = 1 if sampling == "frame" else 2
-        parts = (np.arange(CYCLE * fields) + 0.5) / (CYCLE * fields)
-        self.x_mm = (AMPLITUDE_MM * np.sin(2 * np.pi * parts)).reshape(CYCLE, fields)
-        self.clean = [[bench.still(float(x)) for x in frame] for frame in self.x_mm]
-        self.rest = bench.still()
+    def __init__(self, sampling: str, rng: np.random.Generator, film: Film) -> None:
+        self.film, self.rng, self.sampling = film, rng, sampling
+        self.stage = Stage(BENCH, film, "smooth", sampling)
+        self._image = film.blank()
+        self.n = 0
+        while not self.stage.measuring:
+            if self.n > 100:
+                raise SystemExit(f"no reference from {self.n} frames of the marker at rest")
+            self.show(self.stage, self.clean(self.places_mm(0.0)))
+        self.begin = self.n
 
-    def frame(self, n: int, clean: list[Grey]) -> Frame:
-        scan = Scan.PROGRESSIVE if len(clean) == 1 else Scan.BOTTOM_FIRST
-        whole = clean[0] if len(clean) == 1 else woven(*clean)
-        image = grabbed(whole, self.noise_grey, self.rng)
-        t_ns = 10**9 + n * PERIOD_NS
-        return Frame(n, t_ns, t_ns, 0, 0, 0, PERIOD_NS, image, scan, Damage.NONE, 0, True)
+    def places_mm(self, amplitude_mm: float = AMPLITUDE_MM) -> list[float]:
+        """Return where the marker is in each picture of the next frame, the first one first."""
+        if not amplitude_mm:
+            return [0.0] * len(field_offsets_s(self.sampling))
+        t_s = (self.n - self.begin) * PERIOD_NS / 1e9 + np.array(field_offsets_s(self.sampling))
+        return (amplitude_mm * np.sin(2 * np.pi * t_s)).tolist()
 
-    def measured(self, progress: Progress, frame: Frame) -> tuple[Progress, list[Displacement]]:
-        samples = []
-        for picture in pictures(frame, self.sampling):
-            if progress.phase is Phase.SEARCHING:
-                seen = find_markers(frame.image, progress.plan.shapes, frame.scan)
-                progress, _ = found(progress, seen, frame.t_ns)
-            progress, (sample,), _ = step(progress, picture, self.work)
-            samples.append(sample)
-        return progress, samples
+    def clean(self, places_mm: list[float]) -> Picture:
+        # A film's frame begins with the top field, which is the later one.
+        return self.film.clean([np.array([p]) for p in places_mm[::-1]], np.ones(1))
 
-    def at_rest(self) -> tuple[Progress, int]:
-        """Take a new reference, and return the number of the next frame too."""
-        config = parse_config(
-            f'[setup]\nreference_pictures = {STILLS}\n[process]\nsampling = "{self.sampling}"',
-            "bench",
-        )
-        plan = Plan.of(config)
-        progress = begin(plan, 1, self.bench.width_px, self.bench.height_px)
-        n = 0
-        while progress.phase is not Phase.MEASURING:
-            if n > 2 * STILLS:
-                raise SystemExit(f"no reference after {n} stills at rest: {progress.state}")
-            rest = [self.rest] * self.x_mm.shape[1]
-            progress, _ = self.measured(progress, self.frame(n, rest))
-            n += 1
-        # The swing begins in the middle.
-        return progress, -(-n // CYCLE) * CYCLE
+    def show(self, stage: Stage, clean: Picture) -> list[Displacement]:
+        """Return the samples of the next frame."""
+        unit = self.rng.standard_normal(self.film.pixels, dtype=np.float32)
+        self.film.grab(self._image, clean, unit, NOISE_GREY)
+        samples = stage.show(self.n, self._image)
+        self.n += 1
+        return samples
+
+    def hit(
+        self, kind: str, circles: tuple[int, ...], places_mm: list[float], seed: int
+    ) -> Picture:
+        """Return the next frame's clean picture with a disturbance, the same one for a seed."""
+        fields = []
+        for place in places_mm[::-1]:
+            drawn = self.film.shown(self.clean([place] * len(places_mm)))
+            for circle in circles:
+                drawn[circle] = disturbed(
+                    drawn[circle],
+                    BENCH,
+                    kind,
+                    (circle,),
+                    np.random.default_rng(seed),
+                    (place, 0.0, 0.0),
+                    self.film.windows[circle],
+                )
+            picture = np.empty(self.film.pixels, np.float32)
+            self.film.fill(picture, drawn)
+            fields.append(picture)
+        if len(fields) == 2:
+            fields[0][self.film.top_pixels :] = fields[1][self.film.top_pixels :]
+        return fields[0]
 
 
-def trials(stage: Stage, kind: str, count: int) -> Row:
+def trials(kind: str, sampling: str, count: int, seed: int) -> Row:
     """Hit a disc `count` times, each disc in turn."""
-    rng = stage.rng
+    rng = np.random.default_rng([seed, KINDS.index(kind), len(sampling)])
+    film = Film(BENCH, Way(AMPLITUDE_MM))
     errors: list[NDArray[np.float64]] = []
-    samples = lost = flagged = silent = all_used = 0
+    samples = lost = told = all_used = silent = 0
     for trial in range(count):
         if trial % TRIALS_OF_A_REFERENCE == 0:
-            swinging, n = stage.at_rest()
-        # The swing goes on unhit; what is hit branches off from it.
+            swing = Swing(sampling, rng, film)
         for _ in range(int(rng.integers(3, 12))):
-            swinging, _ = stage.measured(swinging, stage.frame(n, stage.clean[n % CYCLE]))
-            n += 1
-        progress = swinging
-        circles = (0, 1, 2, 3) if kind == ALL else (trial % 4,)
-        seed = int(rng.integers(2**32))
-        for later in range(n, n + HIT_FRAMES):
-            at = later % CYCLE
-            clean = [
-                disturbed(
-                    picture,
-                    stage.bench,
-                    "gradient" if kind == ALL else kind,
-                    circles,
-                    np.random.default_rng(seed),
-                    (float(x), 0.0, 0.0),
-                )
-                for picture, x in zip(stage.clean[at], stage.x_mm[at], strict=True)
-            ]
-            progress, seen = stage.measured(progress, stage.frame(later, clean))
-            for sample, x_mm in zip(seen, stage.x_mm[at], strict=True):
+            swing.show(swing.stage, swing.clean(swing.places_mm()))
+        # What is hit branches off from the swing, which goes on unhit.
+        stage, n = copy(swing.stage), swing.n
+        circles = tuple(range(4)) if kind == ALL else (trial % 4,)
+        drawn_from = int(rng.integers(2**32))
+        for _ in range(HIT_FRAMES):
+            places = swing.places_mm()
+            picture = swing.hit(kind.removesuffix(" on all"), circles, places, drawn_from)
+            for sample, x_mm in zip(swing.show(stage, picture), places, strict=True):
                 samples += 1
-                told = bool(sample.status) or any(c.flags for c in sample.circles)
-                flagged += told
+                told += flagged(sample)
+                all_used += not sample.status
                 if not sample.valid:
                     lost += 1
                     continue
-                own = np.array([sample.x_mm - x_mm, sample.y_mm])
+                error = np.array([sample.x_mm - x_mm, sample.y_mm])
                 sigma = np.array([sample.sigma_x_mm, sample.sigma_y_mm])
-                silent += not told and bool((abs(own) > 4 * sigma).any())
-                all_used += not sample.status
-                errors.append(np.stack([own, sigma]))
-    table = np.array(errors)
-    error_um, ratio = 1000 * table[:, 0], abs(table[:, 0]) / table[:, 1]
-    rms = np.sqrt(np.mean(error_um**2, axis=0))
+                silent += not flagged(sample) and bool((abs(error) > 4 * sigma).any())
+                errors.append(np.stack([error, sigma]))
+        swing.n = n
+    error_um, sigma_um = 1000 * np.array(errors).transpose(1, 0, 2)
     return Row(
         kind=kind,
+        sampling=sampling,
         trials=count,
         samples=samples,
-        rms_x_um=float(rms[0]),
-        rms_y_um=float(rms[1]),
+        rms_x_um=_rms(error_um[:, 0]),
+        rms_y_um=_rms(error_um[:, 1]),
         worst_um=float(abs(error_um).max()),
         lost_percent=100 * lost / samples,
-        flagged_percent=100 * flagged / samples,
-        beyond_4_sigma=int((ratio > 4).any(axis=1).sum()),
-        unflagged_beyond_4_sigma=silent,
-        within_2_sigma=float(np.mean(ratio <= 2)),
+        flagged_percent=100 * told / samples,
         all_used_percent=100 * all_used / samples,
+        beyond_4_sigma=int((abs(error_um) > 4 * sigma_um).any(axis=1).sum()),
+        silent_beyond_4_sigma=silent,
+        within_2_sigma=float(np.mean(abs(error_um) <= 2 * sigma_um)),
+        seed=seed,
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.bench.disturbance",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def _rms(values: Grey) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _row(asked: tuple[str, str, int, int]) -> Row:
+    return trials(*asked)
+
+
+def measured(samplings: Sequence[str], count: int, seed: int, jobs: int) -> list[Row]:
+    """Return a row for each kind of disturbance and sampling, by so many processes."""
+    asked = [(kind, s, count, seed) for s, kind in itertools.product(samplings, KINDS)]
+    with multiprocessing.get_context("spawn").Pool(jobs) as pool:
+        rows = pool.imap(_row, asked)
+        return list(track(rows, "disturbing", len(asked), console=Console(stderr=True)))
+
+
+def table_of(rows: Sequence[Row]) -> Table:
+    table = Table(
+        title=f"One disc hit: {BENCH.distance_m:g} m, {BENCH.angle_deg:g} deg, "
+        f"{AMPLITUDE_MM:g} mm at 1 Hz, noise {NOISE_GREY:g}"
     )
-    parser.add_argument("--kind", nargs="+", choices=KINDS, default=KINDS)
-    parser.add_argument("--trials", type=int, default=150)
-    parser.add_argument("--distance-m", type=float, default=8.0)
-    parser.add_argument("--angle-deg", type=float, default=30.0)
-    parser.add_argument("--noise-grey", type=float, default=2.0)
-    parser.add_argument("--sampling", choices=("frame", "field"), default="frame")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--csv", type=Path, help="write the rows to this file")
-    a = parser.parse_args()
-    bench = Bench(distance_m=a.distance_m, angle_deg=a.angle_deg)
-    rows = []
-    with Bar(console=Console(stderr=True)) as bar:
-        task = bar.add_task("hitting", total=len(a.kind))
-        for n, kind in enumerate(a.kind):
-            stage = Stage(bench, a.sampling, a.noise_grey, a.seed + n)
-            rows.append(trials(stage, kind, a.trials))
-            bar.advance(task)
-    if a.csv:
-        with a.csv.open("w", newline="") as file:
-            writer = csv.DictWriter(file, Row.__dataclass_fields__)
-            writer.writeheader()
-            writer.writerows(asdict(r) for r in rows)
-    table = Table(title=f"One disc hit, {a.distance_m:g} m, {a.angle_deg:g} deg, {a.sampling}")
-    names = ("disturbance", "samples", "rms x um", "rms y um", "worst um", "lost %", "flagged %")
-    for name in (*names, "> 4 sigma", "of these silent", "in 2 sigma", "all used %"):
+    names = ("sampling", "samples", "rms x um", "rms y um", "worst um", "lost %", "flagged %")
+    for name in ("disturbance", *names, "all used %", "> 4 sigma", "silent", "in 2 sigma"):
         table.add_column(name, justify="right")
     for r in rows:
         table.add_row(
-            r.kind,
-            str(r.samples),
+            *(r.kind, r.sampling, str(r.samples)),
             *(f"{v:.2f}" for v in (r.rms_x_um, r.rms_y_um, r.worst_um)),
-            *(f"{v:.1f}" for v in (r.lost_percent, r.flagged_percent)),
-            str(r.beyond_4_sigma),
-            str(r.unflagged_beyond_4_sigma),
-            f"{r.within_2_sigma:.3f}",
-            f"{r.all_used_percent:.1f}",
+            *(f"{v:.1f}" for v in (r.lost_percent, r.flagged_percent, r.all_used_percent)),
+            *(str(r.beyond_4_sigma), str(r.silent_beyond_4_sigma), f"{r.within_2_sigma:.3f}"),
         )
-    Console(width=130, file=sys.stdout).print(table)
-
-
-if __name__ == "__main__":
-    main()
+    return table

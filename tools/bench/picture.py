@@ -5,16 +5,19 @@ rows whatever the distance. A pinhole camera sees it under an angle about the ve
 is the exact integral of the disc's picture over its own area, after a Gaussian blur: the circle's
 image is a conic, its chord along a row is integrated in closed form, and across the rows by a
 quadrature that converges geometrically (the chord's ends are smooth in the parametric angle).
+A part of the picture, a `Window`, is drawn without the rest of it.
 
 Coordinates are those of the product: pixels from the centre of the top-left one, x right, y down;
-millimetres in the marker plane, x right, y up; rotation counter-clockwise.
+millimetres in the marker plane, x right, y up, and z away from the camera at 0 deg; rotation
+counter-clockwise.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from math import ceil, cos, erf, exp, floor, pi, radians, sin, sqrt
+from math import ceil, cos, erf, exp, floor, hypot, pi, radians, sin, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +30,24 @@ DISTURBANCES = ("glare", "specks", "wire", "shadow", "gradient", "cut")
 
 _REACH = 7.0
 """Standard deviations after which a Gaussian is nothing (3e-12)."""
-_STEP = 1 / 128
+_STEP = 1 / 1024
 _U = np.arange(-_REACH, _REACH + 1.5 * _STEP, _STEP)
 _PHI = np.array([0.5 * (1 + erf(u / sqrt(2))) for u in _U])
 _RAMP = _U * _PHI + np.array([exp(-u * u / 2) / sqrt(2 * pi) for u in _U])
+_NODES = 0.8
+"""Blurs from node to node of the quadrature, which leave an error of exp(-2 pi^2 / 0.8^2)."""
+
+Pose = tuple[float, float, float]
+"""x_mm, y_mm, rotation_mrad."""
+
+
+class Window(NamedTuple):
+    """A rectangle of pixels."""
+
+    left: int
+    top: int
+    width: int
+    height: int
 
 
 @dataclass(frozen=True)
@@ -59,12 +76,22 @@ class Bench:
         return np.array([(-h, h), (h, h), (-h, -h), (h, -h)])
 
     @property
+    def background_grey(self) -> float:
+        """Of the picture without the marker."""
+        return self.black_grey
+
+    @property
     def homography(self) -> NDArray[np.float64]:
         """Marker plane in millimetres -> pixels, (3, 3), for the marker at rest."""
+        return self.moved()
+
+    def moved(
+        self, x_mm: float = 0.0, y_mm: float = 0.0, rotation_mrad: float = 0.0, z_mm: float = 0.0
+    ) -> NDArray[np.float64]:
+        """Plane of the moved marker in millimetres -> pixels, (3, 3)."""
         distance_mm = self.distance_m * 1000
         focal = self.fill * self.height_px * distance_mm / self.sheet_mm
         turn, roll = radians(self.angle_deg), radians(self.roll_deg)
-        pose = np.array([[cos(turn), 0, 0], [0, 1, 0], [sin(turn), 0, distance_mm]])
         rolled = np.array([[cos(roll), -sin(roll), 0], [sin(roll), cos(roll), 0], [0, 0, 1]])
         lens = np.array(
             [
@@ -73,44 +100,48 @@ class Bench:
                 [0, 0, 1],
             ]
         )
-        return lens @ rolled @ pose
-
-    def moved(self, x_mm: float, y_mm: float, rotation_mrad: float) -> NDArray[np.float64]:
+        right = np.array([cos(turn), 0, sin(turn)])
+        up = np.array([0, 1, 0])
+        away = np.array([-sin(turn), 0, cos(turn)])
         c, s = cos(rotation_mrad / 1000), sin(rotation_mrad / 1000)
-        return self.homography @ np.array([[c, -s, x_mm], [s, c, y_mm], [0, 0, 1]])
+        place = x_mm * right + y_mm * up + z_mm * away + (0, 0, distance_mm)
+        pose = np.column_stack([c * right + s * up, c * up - s * right, place])
+        return lens @ rolled @ pose
 
     def centres_px(
         self, x_mm: float = 0.0, y_mm: float = 0.0, rotation_mrad: float = 0.0
     ) -> NDArray[np.float64]:
         """Centres of the ellipses (not the pictures of the circles' centres), (4, 2)."""
-        h = self.moved(x_mm, y_mm, rotation_mrad)
-        return np.array([_Ellipse.of(h, c, self.radius_mm).centre for c in self.circles_mm])
+        return np.array([e.centre for e in self._ellipses(self.moved(x_mm, y_mm, rotation_mrad))])
 
-    def cover(
-        self, x_mm: float = 0.0, y_mm: float = 0.0, rotation_mrad: float = 0.0
+    def boxes_px(
+        self, x_mm: float = 0.0, y_mm: float = 0.0, rotation_mrad: float = 0.0, z_mm: float = 0.0
     ) -> NDArray[np.float64]:
-        """The part of each pixel's light that comes from white, (height, width), blur included."""
-        out = np.zeros((self.height_px, self.width_px))
-        h = self.moved(x_mm, y_mm, rotation_mrad)
-        for circle in self.circles_mm:
-            _Ellipse.of(h, circle, self.radius_mm).add(out, self.blur_x_px, self.blur_y_px)
-        return out
-
-    def still(self, x_mm: float = 0.0, y_mm: float = 0.0, rotation_mrad: float = 0.0) -> Grey:
-        """The picture without noise, in grey levels, (height, width)."""
-        return self.black_grey + (self.white_grey - self.black_grey) * self.cover(
-            x_mm, y_mm, rotation_mrad
+        """Left, top, right and bottom of each disc's edge, (4, 4)."""
+        return np.array(
+            [e.box for e in self._ellipses(self.moved(x_mm, y_mm, rotation_mrad, z_mm))]
         )
 
-    def exposed(self, poses: NDArray[np.float64], weights: NDArray[np.float64]) -> Grey:
-        """The mean picture of poses (n, 3) in x_mm, y_mm, rotation_mrad with weights (n,)."""
-        return sum(
-            (w * self.still(*pose) for pose, w in zip(poses, weights, strict=True)),
-            np.zeros((self.height_px, self.width_px)),
-        )
+    def _ellipses(self, homography: NDArray[np.float64]) -> list[Ellipse]:
+        return [Ellipse.of(homography, c, self.radius_mm) for c in self.circles_mm]
+
+    def still(
+        self,
+        x_mm: float = 0.0,
+        y_mm: float = 0.0,
+        rotation_mrad: float = 0.0,
+        z_mm: float = 0.0,
+        window: Window | None = None,
+    ) -> Grey:
+        """The picture without noise, in grey levels, (height, width); of a window, or whole."""
+        window = window or Window(0, 0, self.width_px, self.height_px)
+        cover = np.zeros((window.height, window.width))
+        for ellipse in self._ellipses(self.moved(x_mm, y_mm, rotation_mrad, z_mm)):
+            ellipse.add(cover, window, self.blur_x_px, self.blur_y_px)
+        return self.black_grey + (self.white_grey - self.black_grey) * cover
 
 
-def exposure_nodes(exposure_s: float, count: int = 8) -> tuple[Grey, Grey]:
+def exposure_nodes(exposure_s: float, count: int) -> tuple[Grey, Grey]:
     """Times about the middle of an exposure and their weights (Gauss-Legendre), each (count,)."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return nodes * exposure_s / 2, weights / 2
@@ -137,22 +168,24 @@ def disturbed(
     kind: str,
     circles: tuple[int, ...],
     rng: np.random.Generator,
-    pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    pose: Pose = (0.0, 0.0, 0.0),
+    window: Window | None = None,
 ) -> Grey:
-    """`clean` with a disturbance of `kind` on each of `circles` of the marker at `pose`, drawn from
-    `rng`.
+    """`clean`, the picture in `window` (or the whole one), with a disturbance of `kind` on each of
+    `circles` of the marker at `pose`, drawn from `rng`.
 
     glare: a bright spot near the edge. specks: two to five black or white dots of dirt near the
     edge. wire: a dark or bright line across the disc. shadow: half of the disc in 30..80 % of the
     light. gradient: light that changes by 5..30 % from the disc's centre to its edge, alike on all
     `circles`. cut: 20 % of the disc covered by black.
     """
-    y, x = np.mgrid[0 : bench.height_px, 0 : bench.width_px].astype(np.float64)
+    left, top, width, height = window or Window(0, 0, bench.width_px, bench.height_px)
+    y, x = np.mgrid[top : top + height, left : left + width].astype(np.float64)
     out = clean.copy()
     slope, heading = rng.uniform(0.05, 0.3), rng.uniform(0, 2 * pi)
     homography = bench.moved(*pose)
     for i in circles:
-        ellipse = _Ellipse.of(homography, bench.circles_mm[i], bench.radius_mm)
+        ellipse = Ellipse.of(homography, bench.circles_mm[i], bench.radius_mm)
         # In these coordinates the disc is the unit circle.
         v = (y - ellipse.centre[1]) / ellipse.half_height
         u = (x - ellipse.centre[0] - ellipse.lean * (y - ellipse.centre[1])) / ellipse.half_chord
@@ -195,7 +228,9 @@ def _soft(inside: Grey, width: float) -> Grey:
 
 
 @dataclass(frozen=True)
-class _Ellipse:
+class Ellipse:
+    """The picture of a circle."""
+
     centre: NDArray[np.float64]
     half_height: float
     """Rows from the centre to the top."""
@@ -207,7 +242,7 @@ class _Ellipse:
     @staticmethod
     def of(
         homography: NDArray[np.float64], centre_mm: NDArray[np.float64], radius_mm: float
-    ) -> _Ellipse:
+    ) -> Ellipse:
         x, y = centre_mm
         circle = np.array([[1, 0, -x], [0, 1, -y], [-x, -y, x * x + y * y - radius_mm**2]])
         back = np.linalg.inv(homography)
@@ -215,26 +250,39 @@ class _Ellipse:
         (a, b), (_, c) = conic[:2, :2]
         centre = np.linalg.solve(conic[:2, :2], -conic[:2, 2])
         level = -(conic[2, 2] + conic[2, :2] @ centre)
-        return _Ellipse(
+        return Ellipse(
             centre,
             half_height=sqrt(level * a / (a * c - b * b)),
             half_chord=sqrt(level / a),
             lean=-b / a,
         )
 
-    def add(self, out: Grey, blur_x_px: float, blur_y_px: float) -> None:
+    @property
+    def box(self) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom."""
+        (x, y), half_width = self.centre, hypot(self.half_chord, self.lean * self.half_height)
+        return x - half_width, y - self.half_height, x + half_width, y + self.half_height
+
+    def add(self, out: Grey, window: Window, blur_x_px: float, blur_y_px: float) -> None:
+        """Add to `out` the part of each pixel's light in the window that comes from the disc."""
         cx, cy = self.centre
-        # A third of the blur from node to node leaves an error of exp(-2 pi^2 9).
-        nodes = ceil(pi * self.half_height / (min(blur_y_px, 1.0) / 3)) + 8
+        finest = min(blur_y_px, blur_x_px * self.half_height / self.half_chord)
+        nodes = ceil(pi * self.half_height / (_NODES * finest)) + 8
         t = pi * ((np.arange(nodes) + 0.5) / nodes - 0.5)
         drop = self.half_height * np.sin(t)
         weight = self.half_height * np.cos(t) * pi / nodes
         middle = cx + self.lean * drop
         half = self.half_chord * np.cos(t)
-        reach_y = self.half_height + _REACH * blur_y_px + 1
-        reach_x = self.half_chord + abs(self.lean) * self.half_height + _REACH * blur_x_px + 1
-        rows = np.arange(max(0, floor(cy - reach_y)), min(len(out), ceil(cy + reach_y) + 1))
-        columns = np.arange(max(0, floor(cx - reach_x)), min(out.shape[1], ceil(cx + reach_x) + 1))
+        left, top, right, bottom = self.box
+        far_x, far_y = _REACH * blur_x_px + 1, _REACH * blur_y_px + 1
+        rows = np.arange(
+            max(window.top, floor(top - far_y)),
+            min(window.top + window.height, ceil(bottom + far_y) + 1),
+        )
+        columns = np.arange(
+            max(window.left, floor(left - far_x)),
+            min(window.left + window.width, ceil(right + far_x) + 1),
+        )
         if not len(rows) or not len(columns):
             return
         row_edges = np.append(rows, rows[-1] + 1) - 0.5
@@ -244,23 +292,22 @@ class _Ellipse:
             _table(_RAMP, (column_edges - (middle - half)[:, None]) / blur_x_px, 1.0)
             - _table(_RAMP, (column_edges - (middle + half)[:, None]) / blur_x_px, 1.0)
         )
-        out[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += (
+        first_row, first_column = rows[0] - window.top, columns[0] - window.left
+        out[first_row : first_row + len(rows), first_column : first_column + len(columns)] += (
             np.diff(below, axis=0) * weight
         ) @ np.diff(along, axis=1)
 
 
 def _table(values: Grey, u: Grey, slope_beyond: float) -> Grey:
-    """`values` over `_U` at u, by cubic interpolation; beyond the right end they rise by
+    """`values` over `_U` at u, by linear interpolation (to 5e-8); beyond the right end they rise by
     `slope_beyond`, beyond the left end they are 0."""
-    at = np.clip((u + _REACH) / _STEP, 1, len(_U) - 3)
-    i = at.astype(np.int64)
-    f = at - i
-    p0, p1, p2, p3 = values[i - 1], values[i], values[i + 1], values[i + 2]
-    cubic = p1 + f * (
-        (p2 - p0) / 2
-        + f * (p0 - 2.5 * p1 + 2 * p2 - p3 / 2 + f * ((p3 - p0) / 2 + 1.5 * (p1 - p2)))
-    )
-    return cubic + slope_beyond * np.maximum(u - _U[-3], 0)
+    at = np.clip((u + _REACH) / _STEP, 0, len(_U) - 2)
+    i = at.astype(np.int32)
+    low = values.take(i)
+    between = low + (at - i) * (values.take(i + 1) - low)
+    if slope_beyond:
+        between += slope_beyond * np.maximum(u - _U[-2], 0)
+    return between
 
 
 def main() -> None:
