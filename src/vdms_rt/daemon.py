@@ -84,7 +84,9 @@ class Daemon:
         )
         self._ring = Ring(config.process.ring_slots, live=live)
         self._search = Search([m.shape for m in config.marker])
-        self._capture = Capture(config, self._ring, self._outlet.event, self._outlet.truth)
+        self._capture = Capture(
+            config, self._ring, self._outlet.event, self._outlet.truth, self._idle
+        )
         stored, trusted = self._stored_set_up()
         self._processor = Processor(
             config,
@@ -258,6 +260,10 @@ class Daemon:
         idle = not health.captured and not self._signal
         failed = self._faults or failure or health.record_trouble or idle
         return 1 if failed else 0
+
+    def _idle(self) -> bool:
+        """Return whether no marker was found yet."""
+        return self._processor.counters.state in (State.STARTING, State.SEARCHING)
 
     def _stored_set_up(self) -> tuple[SetUp | None, bool]:
         """Return the set-up to begin with, and whether it holds without a look at the picture."""

@@ -30,7 +30,7 @@ def test_300_frames_are_what_was_sent(usbtv, pictures):
     assert {"ntsc-m", "pal"} <= set(device.standards)
     assert device.formats == ("YUYV",)
     for name in ("auto", "1b71:3002", "EASY01", device.usb_port):
-        assert choose_device(name) == device.node
+        assert choose_device(name) == device
 
     with opened(input=1, standard="ntsc-m") as source:
         info = source.info

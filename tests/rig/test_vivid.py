@@ -13,7 +13,8 @@ from rig.frames import PERIOD_FRAMES, REST_FRAMES
 from rig.reading import last_words, new_image, skip_to_known, take, take_known
 
 from vdms_rt.capture import v4l2_api as api
-from vdms_rt.capture.grabber import choose_device, devices_table, list_devices
+from vdms_rt.capture.devices import devices_table, look_through
+from vdms_rt.capture.grabber import choose_device, list_devices
 from vdms_rt.capture.v4l2 import V4l2Source
 from vdms_rt.config import V4l2
 from vdms_rt.model import Damage, Scan, SourceError, StampEvent
@@ -74,7 +75,8 @@ def test_300_ntsc_frames_of_the_marker(vivid, pictures):
 def test_closes_and_opens_again(vivid):
     for _ in range(3):
         with opened(vivid) as source:
-            assert [g.sequence for g in take(source, 2)[1]] == [0, 1]
+            # The first image of a stream is not taken.
+            assert [g.sequence for g in take(source, 2)[1]] == [1, 2]
 
 
 def test_pal_is_detected(vivid):
@@ -129,7 +131,10 @@ def test_alternating_fields_come_one_by_one(striped):
         assert (source.info.width_px, source.info.height_px) == (720, 240)
         assert (source.info.scan, source.info.scan_known) == (Scan.TOP, True)
         images, grabs = take(source, 20)
-    assert [g.scan for g in grabs] == [Scan.BOTTOM, Scan.TOP] * 10
+    # Bottom and top of each sequence number, but for those that the machine was too slow for.
+    fields = [(g.sequence, g.scan is Scan.TOP) for g in grabs]
+    assert fields == sorted(set(fields))
+    assert {g.scan for g in grabs} == {Scan.BOTTOM, Scan.TOP}
     for image, grab in zip(images, grabs, strict=True):
         first = 1 if grab.scan == Scan.BOTTOM else 0
         np.testing.assert_array_equal(image, frame[first::2])
@@ -326,7 +331,10 @@ def test_devices_of_the_computer(vivid):
     assert {"YUYV", "UYVY", "GREY"} <= set(capture.formats)
     assert capture.usable
     assert not output.usable
-    assert choose_device("auto") == vivid.node
-    table = devices_table([capture, output])
-    assert f"{vivid.node} (vivid)" in table
-    assert "no use    is not a capture device" in table
+    assert choose_device("auto").node == vivid.node
+    table = devices_table(look_through([capture, output])).splitlines()
+    assert "signal now  ntsc-m, none: the picture is a test card" in [
+        line.replace("pal,", "ntsc-m,") for line in table
+    ]
+    assert f'device =    "{vivid.node}"' in table
+    assert f"Of no use: {vivid.output_node} (vivid) is not a capture device." in table

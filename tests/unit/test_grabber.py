@@ -1,13 +1,19 @@
-"""Which device a person means, and how devices are shown."""
+"""Which device a person means."""
 
-import errno
-import os
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from vdms_rt.capture import grabber
-from vdms_rt.capture.grabber import DeviceInfo, choose_device, devices_table, list_devices
+from vdms_rt.capture.grabber import (
+    NO_DEVICE,
+    DeviceInfo,
+    better_device,
+    choose_device,
+    list_devices,
+    setting_for,
+)
+from vdms_rt.capture.v4l2_node import DeviceGone
 from vdms_rt.model import SourceError
 
 WEBCAM = DeviceInfo(
@@ -42,14 +48,18 @@ EASYCAP = DeviceInfo(
     capture=True,
 )
 OTHER_EASYCAP = replace(EASYCAP, node="/dev/video4", serial="EASY02", usb_port="1-1.4")
+UNKNOWN = replace(CONVERTER, node="/dev/video7", usb_id="1234:5678", usb_port="1-5")
 BAYER = replace(WEBCAM, node="/dev/video5", card="Sensor", formats=("BA81",), usb_port="1-7")
 LOCKED = DeviceInfo(node="/dev/video6", trouble="no permission to open /dev/video6; do this")
 
 
 def test_auto_prefers_analogue_grabbers_then_converters():
-    assert choose_device("auto", [WEBCAM, METADATA, CONVERTER, EASYCAP]) == "/dev/video3"
-    assert choose_device("auto", [WEBCAM, METADATA, CONVERTER]) == "/dev/video2"
-    assert choose_device("auto", [METADATA, BAYER, WEBCAM]) == "/dev/video0"
+    assert choose_device("auto", [WEBCAM, METADATA, CONVERTER, EASYCAP]) == EASYCAP
+    assert choose_device("auto", [WEBCAM, METADATA, CONVERTER]) == CONVERTER
+    assert choose_device("auto", [METADATA, BAYER, WEBCAM]) == WEBCAM
+    # What cannot be unplugged is the computer's own camera.
+    assert choose_device("auto", [replace(WEBCAM, built_in=True), UNKNOWN]) == UNKNOWN
+    assert choose_device("auto", [replace(WEBCAM, built_in=True)]).node == WEBCAM.node
 
 
 @pytest.mark.parametrize(
@@ -64,18 +74,71 @@ def test_auto_prefers_analogue_grabbers_then_converters():
     ],
 )
 def test_device_by_usb_id_serial_or_port(text, node):
-    assert choose_device(text, [METADATA, WEBCAM, CONVERTER, EASYCAP]) == node
+    assert choose_device(text, [METADATA, WEBCAM, CONVERTER, EASYCAP]).node == node
 
 
-def test_a_path_is_taken_as_it_is():
-    assert choose_device("/dev/v4l/by-id/some-grabber", []) == "/dev/v4l/by-id/some-grabber"
+def test_a_path_means_the_node_that_it_leads_to(tmp_path):
+    link = tmp_path / "the-grabber"
+    link.symlink_to(EASYCAP.node)
+    assert choose_device(str(link), [WEBCAM, EASYCAP]) == replace(EASYCAP, node=str(link))
+    assert choose_device("/dev/video3", [WEBCAM, EASYCAP]) == EASYCAP
+    assert choose_device("/dev/video9", [WEBCAM]) == DeviceInfo("/dev/video9")
+
+
+SLOW = replace(EASYCAP, speed_mbit_s=12)
+
+
+@pytest.mark.parametrize("text", ["auto", "1b71:3002", "EASY01", "1-1.3", "/dev/video3"])
+def test_a_usb_1_link_is_refused_with_the_reason(text):
+    with pytest.raises(SourceError) as caught:
+        choose_device(text, [SLOW])
+    assert "/dev/video3 (usbtv) is on a USB 1.1 link of 12 Mbit/s" in str(caught.value)
+    assert "plug it into a USB 2.0 port" in str(caught.value)
+
+
+def test_auto_keeps_to_the_device_that_was_in_use():
+    moved = replace(EASYCAP, node="/dev/video7", usb_port="3-2")
+    assert choose_device("auto", [WEBCAM, moved], before=EASYCAP) == moved
+    with pytest.raises(DeviceGone) as caught:
+        choose_device("auto", [WEBCAM, OTHER_EASYCAP], before=EASYCAP)
+    assert str(caught.value) == (
+        "/dev/video3 (usbtv) is not there; plug it in again, or start vdms-rt anew to use another"
+    )
+    with pytest.raises(DeviceGone):
+        choose_device("auto", [], before=EASYCAP)
+
+
+def test_of_two_that_are_alike_auto_keeps_to_the_port():
+    twin = replace(EASYCAP, node="/dev/video8", usb_port="1-1.4")
+    back = replace(EASYCAP, node="/dev/video9")
+    assert choose_device("auto", [twin, back], before=EASYCAP) == back
+    third = replace(twin, node="/dev/video10", usb_port="1-2")
+    with pytest.raises(SourceError, match="2 video devices are like the one that was in use"):
+        choose_device("auto", [twin, third], before=EASYCAP)
+
+
+@pytest.mark.parametrize(
+    ("device", "others", "setting"),
+    [
+        (EASYCAP, [OTHER_EASYCAP], "EASY01"),
+        (CONVERTER, [EASYCAP], "534d:0021"),
+        (CONVERTER, [replace(CONVERTER, node="/dev/video9", usb_port="1-3")], "1-2"),
+        (EASYCAP, [replace(EASYCAP, node="/dev/video9", usb_port="1-3")], "1-1.3"),
+        (WEBCAM, [METADATA], "0001"),
+        (DeviceInfo("/dev/video0", capture=True, formats=("YUYV",)), [EASYCAP], "/dev/video0"),
+    ],
+)
+def test_the_setting_for_a_device_means_that_one_alone(device, others, setting):
+    devices = [*others, device]
+    assert setting_for(device, devices) == setting
+    assert choose_device(setting, devices).node == device.node
 
 
 @pytest.mark.parametrize(
     ("text", "devices", "sentence"),
     [
-        ("auto", [], grabber.NO_DEVICE),
-        ("1b71:3002", [], grabber.NO_DEVICE),
+        ("auto", [], NO_DEVICE),
+        ("1b71:3002", [], NO_DEVICE),
         ("auto", [LOCKED], "no permission to open /dev/video6; do this"),
         (
             "auto",
@@ -111,7 +174,7 @@ def test_a_path_is_taken_as_it_is():
 )
 def test_sentence_when_no_device_fits(text, devices, sentence):
     with pytest.raises(SourceError) as caught:
-        choose_device(text, devices)
+        choose_device(text, devices, sysfs=Path("/no-sysfs"))
     assert str(caught.value) == sentence
 
 
@@ -120,36 +183,14 @@ def test_an_empty_name_means_no_device_without_serial():
         choose_device("", [CONVERTER, EASYCAP])
 
 
-def test_table_for_a_person():
-    assert devices_table([EASYCAP, METADATA, LOCKED]) == (
-        "/dev/video3 (usbtv)\n"
-        "  driver    usbtv\n"
-        "  bus       usb-0000:00:14.0-1.3\n"
-        "  USB       1b71:3002, serial EASY01, port 1-1.3, 480 Mbit/s\n"
-        "  inputs    0 Composite, 1 S-Video\n"
-        "  standards ntsc-m, pal\n"
-        "  formats   YUYV\n"
-        "\n"
-        "/dev/video1 (Laptop Camera)\n"
-        "  driver    uvcvideo\n"
-        "  bus       usb-0000:00:14.0-6\n"
-        "  USB       04f2:b6d9, serial 0001, port 1-6, 480 Mbit/s\n"
-        "  no use    is not a capture device\n"
-        "\n"
-        "/dev/video6\n"
-        "  trouble   no permission to open /dev/video6; do this"
-    )
-
-
-def test_table_without_devices_is_one_sentence():
-    assert devices_table([]) == (
-        "No video device on this computer; plug the frame grabber in, and see with `lsusb` and "
-        "`dmesg` whether the kernel knows it."
-    )
-
-
 def test_devices_of_a_computer_without_video(tmp_path):
-    assert list_devices(tmp_path / "video4linux") == []
+    assert list_devices(tmp_path) == []
+    with pytest.raises(DeviceGone, match="no video device on this computer"):
+        choose_device("auto", sysfs=tmp_path)
+
+
+def usb_device(sysfs):
+    return (sysfs / "class" / "video4linux" / "video87654" / "device").resolve().parent
 
 
 @pytest.fixture
@@ -173,7 +214,7 @@ def sysfs(tmp_path):
         device.mkdir(parents=True, exist_ok=True)
         (classes / name).mkdir(parents=True)
         (classes / name / "device").symlink_to(device)
-    return classes
+    return tmp_path
 
 
 def test_usb_facts_come_from_sysfs_also_when_the_node_cannot_be_opened(sysfs):
@@ -187,21 +228,32 @@ def test_usb_facts_come_from_sysfs_also_when_the_node_cannot_be_opened(sysfs):
 
 
 def test_speed_that_the_kernel_does_not_know(sysfs):
-    usb = (sysfs / "video87654" / "device").resolve().parent
+    usb = usb_device(sysfs)
     (usb / "speed").write_text("unknown\n")
     assert list_devices(sysfs)[0].speed_mbit_s is None
 
 
-@pytest.mark.parametrize(
-    ("number", "part"),
-    [
-        (errno.EACCES, "no permission to open /dev/video0; add the user to the group video"),
-        (errno.ENOENT, "/dev/video0 is not there; plug the device in"),
-        (errno.ENODEV, "/dev/video0 is not there; plug the device in"),
-        (errno.EBUSY, "/dev/video0 is in use by another program; end it"),
-        (errno.EIO, "cannot open /dev/video0: Input/output error; set v4l2.device"),
-    ],
-)
-def test_sentence_for_a_node_that_does_not_open(number, part):
-    text = grabber.open_sentence("/dev/video0", OSError(number, os.strerror(number)))
-    assert text.startswith(part)
+def test_a_grabber_plugged_in_is_better_than_a_webcam(sysfs):
+    assert better_device("auto", WEBCAM, sysfs)
+    assert not better_device("/dev/video0", WEBCAM, sysfs)
+    assert not better_device("auto", EASYCAP, sysfs)
+    (usb_device(sysfs) / "idVendor").write_text("04f2")
+    assert not better_device("auto", WEBCAM, sysfs)
+
+
+def test_a_known_grabber_without_a_driver_is_named(tmp_path):
+    usb = tmp_path / "bus" / "usb" / "devices" / "1-4"
+    (usb / "1-4:1.0").mkdir(parents=True)
+    (usb / "idVendor").write_text("05e1\n")
+    (usb / "idProduct").write_text("0408\n")
+    with pytest.raises(SourceError) as caught:
+        choose_device("auto", sysfs=tmp_path)
+    assert str(caught.value) == (
+        "the frame grabber 05e1:0408 at USB port 1-4 has no driver; load it with `sudo modprobe "
+        "stk1160`, and see with `dmesg` what the kernel says"
+    )
+    with pytest.raises(SourceError, match="has no driver"):
+        choose_device("auto", [METADATA], sysfs=tmp_path)
+    (usb / "1-4:1.0" / "video4linux" / "video0").mkdir(parents=True)
+    with pytest.raises(SourceError, match="no video device on this computer"):
+        choose_device("auto", sysfs=tmp_path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 from collections.abc import Sequence
@@ -10,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vdms_rt.capture import v4l2_api as api
+from vdms_rt.capture.v4l2_node import DeviceGone, open_error
 from vdms_rt.model import SourceError
 
 PIXEL_FORMATS = ("YUYV", "UYVY", "GREY", "MJPG")
@@ -18,15 +18,41 @@ PIXEL_FORMATS = ("YUYV", "UYVY", "GREY", "MJPG")
 ANALOGUE_DRIVERS = ("stk1160", "usbtv", "em28xx", "cx231xx")
 """Kernel drivers of USB grabbers for composite and S-Video."""
 
-UVC_GRABBERS = ("534d:0021",)
-"""USB ids of grabbers that say to be a UVC camera."""
+GRABBERS = {
+    "05e1:0408": "stk1160",
+    "1b71:3002": "usbtv",
+    "1f71:3301": "usbtv",
+    "1f71:3306": "usbtv",
+    "eb1a:2860": "em28xx",
+    "eb1a:2861": "em28xx",
+    "eb1a:2863": "em28xx",
+    "eb1a:5051": "em28xx",
+    "1b80:e302": "em28xx",
+    "1b80:e304": "em28xx",
+    "1b80:e309": "em28xx",
+    "1b80:e349": "em28xx",
+    "2304:0207": "em28xx",
+    "2304:021a": "em28xx",
+    "0fd9:0033": "em28xx",
+    "2040:c200": "cx231xx",
+    "0fd9:0037": "cx231xx",
+    "1f4d:0102": "cx231xx",
+    "1f4d:0237": "cx231xx",
+    "1d19:6108": "cx231xx",
+    "1d19:6109": "cx231xx",
+    "534d:0021": "uvcvideo",
+}
+"""Kernel drivers of known USB grabbers, by USB id."""
+
+LEAST_MBIT_S = 480.0
+"""The link that pictures need: 720 x 480 at 29.97 Hz in YUYV are 166 Mbit/s. USB 1.1 has 12."""
 
 NO_DEVICE = (
     "no video device on this computer; plug the frame grabber in, and see with `lsusb` and "
     "`dmesg` whether the kernel knows it"
 )
 
-_SYSFS = Path("/sys/class/video4linux")
+SYSFS = Path("/sys")
 _USB_ID = re.compile(r"[0-9a-fA-F]{4}:[0-9a-fA-F]{4}")
 
 
@@ -50,60 +76,143 @@ class DeviceInfo:
     formats: tuple[str, ...] = ()
     capture: bool = False
     """It gives pictures by streaming."""
+    built_in: bool = False
+    """It cannot be unplugged: the computer's own camera."""
     trouble: str = ""
     """Why it could not be asked, in a sentence."""
 
     @property
     def usable(self) -> bool:
-        return self.capture and any(f in PIXEL_FORMATS for f in self.formats)
+        return self.capture and any(f in PIXEL_FORMATS for f in self.formats) and not self.slow
+
+    @property
+    def slow(self) -> bool:
+        """It is on a link of USB 1.1."""
+        return self.speed_mbit_s is not None and self.speed_mbit_s < LEAST_MBIT_S
+
+    @property
+    def grabber(self) -> bool:
+        """It is a known frame grabber."""
+        return self.driver in ANALOGUE_DRIVERS or self.usb_id in GRABBERS
 
     @property
     def title(self) -> str:
         """The node and, where it could be asked, its name."""
         return f"{self.node} ({self.card})" if self.card else self.node
 
+    def same_as(self, other: DeviceInfo) -> bool:
+        """Whether this may be that device come back, perhaps as another node or at another port."""
+        if not other.usb_id:
+            return (self.driver, self.bus_info) == (other.driver, other.bus_info)
+        return (self.usb_id, self.serial) == (other.usb_id, other.serial)
 
-def list_devices(sysfs: Path = _SYSFS) -> list[DeviceInfo]:
+
+def list_devices(sysfs: Path = SYSFS) -> list[DeviceInfo]:
     """Return every video node of this computer in the order of their numbers."""
     try:
-        entries = [entry for entry in sysfs.iterdir() if entry.name.startswith("video")]
+        found = list((sysfs / "class" / "video4linux").iterdir())
     except FileNotFoundError:
         return []
-    entries.sort(key=lambda entry: (len(entry.name), entry.name))
-    return [_describe(f"/dev/{entry.name}", _usb_facts(entry / "device")) for entry in entries]
+    entries = sorted((len(entry.name), entry) for entry in found if entry.name.startswith("video"))
+    return [_describe(f"/dev/{entry.name}", _usb_facts(entry / "device")) for _, entry in entries]
 
 
-def choose_device(text: str, devices: Sequence[DeviceInfo] | None = None) -> str:
-    """Return the node that `v4l2.device` means: a path, "auto", a VID:PID, a serial or a port.
+def choose_device(
+    text: str,
+    devices: Sequence[DeviceInfo] | None = None,
+    before: DeviceInfo | None = None,
+    sysfs: Path = SYSFS,
+) -> DeviceInfo:
+    """Return the device that `v4l2.device` means: a path, "auto", a VID:PID, a serial or a port.
 
     `devices` are those to choose from, of this computer by default. "auto" is the first usable
-    analogue grabber, else the first usable UVC grabber, else the first usable node. A path is
-    returned as it is. Raises SourceError when nothing or more than one device fits.
+    analogue grabber, else another known grabber, else the first usable device that is not the
+    computer's own camera, else that.
+    With `before`, the device that was in use, it means that one alone: the reference is of its
+    pictures. Raises DeviceGone when none fits that may still come, SourceError when none is usable
+    or more than one fits.
     """
+    devices = list_devices(sysfs) if devices is None else devices
     if text.startswith("/"):
-        return text
-    devices = list_devices() if devices is None else devices
+        return _at_path(text, devices)
+    if text == "auto" and before is not None:
+        return _come_back(before, devices)
     if not devices:
-        raise SourceError(NO_DEVICE)
+        raise DeviceGone(no_device(sysfs))
     if text == "auto":
-        return _first_usable(devices)
+        return _first_usable(devices, sysfs)
     fitting = [d for d in devices if _means(text, d)]
-    usable = [d for d in fitting if d.usable]
-    if not usable:
-        if fitting:
-            raise SourceError(_no_use(fitting))
+    if not fitting:
         kind = "with USB id" if _USB_ID.fullmatch(text) else "with serial or USB port"
-        raise SourceError(
+        raise DeviceGone(
             f"no video device {kind} {text}; plug it in, or set v4l2.device to one of those here: "
             f"{_titles(devices)}"
         )
-    # One device may have several nodes; two devices are two ports.
-    if len({d.usb_port for d in usable}) > 1:
-        raise SourceError(
-            f"{len(usable)} video devices are {text}: {_titles(usable)}; set v4l2.device to the "
-            f"USB port of one: {', '.join(d.usb_port for d in usable)}"
+    usable = [d for d in fitting if d.usable]
+    if not usable:
+        raise SourceError(_no_use(fitting))
+    return _only(usable, f"are {text}")
+
+
+def no_device(sysfs: Path = SYSFS) -> str:
+    """Return why there is no video device, and what to do."""
+    return _unbound(sysfs) or NO_DEVICE
+
+
+def better_device(text: str, now: DeviceInfo, sysfs: Path = SYSFS) -> bool:
+    """Return whether "auto", now that `now` is in use, would rather take a known grabber that was
+    plugged in since. Opens no device."""
+    if text != "auto" or now.grabber:
+        return False
+    found = (sysfs / "class" / "video4linux").glob("video*")
+    return any(_usb_facts(entry / "device").get("id") in GRABBERS for entry in found)
+
+
+def setting_for(device: DeviceInfo, devices: Sequence[DeviceInfo]) -> str:
+    """Return what to write as `v4l2.device` for this device among those of the computer: its
+    serial or USB id where no other has the same, else its port; for no USB device its node."""
+    usable = [d for d in devices if d.usable]
+    for text in (device.serial, device.usb_id):
+        if text and {d.usb_port for d in usable if _means(text, d)} == {device.usb_port}:
+            return text
+    return device.usb_port or device.node
+
+
+def why_unusable(device: DeviceInfo) -> str:
+    """Return why a device is not usable, as the rest of a sentence."""
+    if not device.capture:
+        return "is not a capture device"
+    if device.slow:
+        return (
+            f"is on a USB 1.1 link of {device.speed_mbit_s:g} Mbit/s, and its pictures need "
+            f"{LEAST_MBIT_S:g}; plug it into a USB 2.0 port without an old hub or cable between"
         )
-    return usable[0].node
+    return f"has only {', '.join(device.formats) or 'no format'}"
+
+
+def _at_path(path: str, devices: Sequence[DeviceInfo]) -> DeviceInfo:
+    # A link, as udev makes them, leads to another node after the device was plugged in anew.
+    node = os.path.realpath(path)
+    device = next((d for d in devices if d.node == node), DeviceInfo(node))
+    if device.slow:
+        raise SourceError(f"{device.title} {why_unusable(device)}")
+    return replace(device, node=path) if path != node else device
+
+
+def _come_back(before: DeviceInfo, devices: Sequence[DeviceInfo]) -> DeviceInfo:
+    fitting = [d for d in devices if d.usable and d.same_as(before)]
+    at_port = [d for d in fitting if d.usb_port == before.usb_port]
+    if fitting:
+        return at_port[0] if at_port else _only(fitting, "are like the one that was in use")
+    # A node that cannot be opened yet does not say what it is.
+    for device in devices:
+        if device.trouble and before.usb_id and device.usb_id == before.usb_id:
+            raise SourceError(device.trouble)
+        if device.slow and device.same_as(before):
+            raise SourceError(f"{device.title} {why_unusable(device)}")
+    raise DeviceGone(
+        f"{before.title} is not there; plug it in again, or start vdms-rt anew to use another"
+    )
 
 
 def _means(text: str, device: DeviceInfo) -> bool:
@@ -112,84 +221,53 @@ def _means(text: str, device: DeviceInfo) -> bool:
     return named and text != ""
 
 
-def devices_table(devices: Sequence[DeviceInfo]) -> str:
-    """Return the devices as text for a person, or one sentence when there are none."""
-    if not devices:
-        return NO_DEVICE[0].upper() + NO_DEVICE[1:] + "."
-    return "\n\n".join(_paragraph(device) for device in devices)
+def _only(usable: Sequence[DeviceInfo], what: str) -> DeviceInfo:
+    # One device may have several nodes; two devices are two ports.
+    if len({d.usb_port for d in usable}) > 1:
+        raise SourceError(
+            f"{len(usable)} video devices {what}: {_titles(usable)}; set v4l2.device to the "
+            f"USB port of one: {', '.join(d.usb_port for d in usable)}"
+        )
+    return usable[0]
 
 
-def _paragraph(device: DeviceInfo) -> str:
-    rows = [("driver", device.driver), ("bus", device.bus_info)]
-    if device.usb_id:
-        speed = f", {device.speed_mbit_s:g} Mbit/s" if device.speed_mbit_s else ""
-        serial = f", serial {device.serial}" if device.serial else ""
-        rows.append(("USB", f"{device.usb_id}{serial}, port {device.usb_port}{speed}"))
-    if device.capture:
-        names = [f"{index} {name}" for index, name in enumerate(device.inputs)]
-        rows.append(("inputs", ", ".join(names)))
-        rows.append(("standards", ", ".join(device.standards)))
-        rows.append(("formats", ", ".join(device.formats)))
-    if device.trouble:
-        rows.append(("trouble", device.trouble))
-    elif not device.usable:
-        rows.append(("no use", _why_unusable(device)))
-    return "\n".join([device.title, *(f"  {name:<10}{text}" for name, text in rows if text)])
-
-
-def _first_usable(devices: Sequence[DeviceInfo]) -> str:
-    def rank(device: DeviceInfo) -> int:
-        if device.driver in ANALOGUE_DRIVERS:
-            return 0
-        return 1 if device.usb_id in UVC_GRABBERS else 2
+def _first_usable(devices: Sequence[DeviceInfo], sysfs: Path) -> DeviceInfo:
+    def rank(device: DeviceInfo) -> tuple[bool, bool, bool]:
+        return device.driver not in ANALOGUE_DRIVERS, not device.grabber, device.built_in
 
     usable = [device for device in devices if device.usable]
     if not usable:
-        raise SourceError(_no_use(devices))
-    return min(usable, key=rank).node
+        why = _unbound(sysfs)
+        raise SourceError(why or _no_use(devices))
+    return min(usable, key=rank)
+
+
+def _unbound(sysfs: Path) -> str:
+    """Return a sentence on a known grabber that no driver has taken; empty if there is none."""
+    for directory in sorted((sysfs / "bus" / "usb" / "devices").glob("*-*")):
+        usb_id = f"{_read(directory / 'idVendor')}:{_read(directory / 'idProduct')}"
+        driver = GRABBERS.get(usb_id)
+        if driver and not list(directory.glob("*/video4linux/video*")):
+            return (
+                f"the frame grabber {usb_id} at USB port {directory.name} has no driver; load it "
+                f"with `sudo modprobe {driver}`, and see with `dmesg` what the kernel says"
+            )
+    return ""
 
 
 def _no_use(devices: Sequence[DeviceInfo]) -> str:
     for device in devices:
         if device.trouble:
             return device.trouble
-    reasons = "; ".join(f"{d.title} {_why_unusable(d)}" for d in devices)
+    for device in devices:
+        if device.slow:
+            return f"{device.title} {why_unusable(device)}"
+    reasons = "; ".join(f"{d.title} {why_unusable(d)}" for d in devices)
     return f"no video device gives pictures that vdms-rt reads: {reasons}; plug in a frame grabber"
-
-
-def _why_unusable(device: DeviceInfo) -> str:
-    if not device.capture:
-        return "is not a capture device"
-    return f"has only {', '.join(device.formats) or 'no format'}"
 
 
 def _titles(devices: Sequence[DeviceInfo]) -> str:
     return ", ".join(device.title for device in devices)
-
-
-def open_sentence(node: str, error: OSError) -> str:
-    """Return why a node could not be opened and how to mend it."""
-    if error.errno in (errno.EACCES, errno.EPERM):
-        return (
-            f"no permission to open {node}; add the user to the group video "
-            "(sudo usermod -aG video USER) and log in again"
-        )
-    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        return (
-            f"{node} is not there; plug the device in, or set v4l2.device to another "
-            "(`vdms-rt devices` lists them)"
-        )
-    if error.errno == errno.EBUSY:
-        return busy_sentence(node)
-    return f"cannot open {node}: {error.strerror}; set v4l2.device to a video capture node"
-
-
-def busy_sentence(name: str) -> str:
-    """Return that another program has the device, and how to learn which."""
-    return (
-        f"{name} is in use by another program; end it (`fuser -v /dev/video*` names it), or set "
-        "v4l2.device to another"
-    )
 
 
 def _describe(node: str, usb: dict[str, str]) -> DeviceInfo:
@@ -199,11 +277,12 @@ def _describe(node: str, usb: dict[str, str]) -> DeviceInfo:
         serial=usb.get("serial", ""),
         usb_port=usb.get("port", ""),
         speed_mbit_s=_number(usb.get("speed", "")),
+        built_in=usb.get("removable") == "fixed",
     )
     try:
         fd = api.open_node(node)
     except OSError as error:
-        return replace(known, trouble=open_sentence(node, error))
+        return replace(known, trouble=str(open_error(node, error)))
     try:
         about = api.capability(fd)
         capture = about.of_node & api.CAP_VIDEO_CAPTURE and about.of_node & api.CAP_STREAMING
@@ -228,7 +307,7 @@ def _describe(node: str, usb: dict[str, str]) -> DeviceInfo:
 
 
 def _usb_facts(device: Path) -> dict[str, str]:
-    """Return id, serial, port and speed of the USB device that a sysfs device lies in, or {}."""
+    """Return what sysfs says of the USB device that a device lies in, {} if it lies in none."""
     resolved = device.resolve()
     for directory in (resolved, *resolved.parents):
         if (directory / "idVendor").exists():
@@ -240,6 +319,7 @@ def _usb_facts(device: Path) -> dict[str, str]:
         "serial": _read(directory / "serial"),
         "port": directory.name,
         "speed": _read(directory / "speed"),
+        "removable": _read(directory / "removable"),
     }
     return {name: value for name, value in facts.items() if value}
 

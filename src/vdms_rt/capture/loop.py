@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from vdms_rt.capture.clock import ClockFigures, FrameClock
+from vdms_rt.capture.device import Device
 from vdms_rt.capture.source import Source, open_source
 from vdms_rt.config import Config
 from vdms_rt.model import (
@@ -15,6 +16,7 @@ from vdms_rt.model import (
     Event,
     Frame,
     Grab,
+    Luma,
     Severity,
     SourceEnded,
     SourceError,
@@ -23,17 +25,10 @@ from vdms_rt.model import (
     Tick,
     Truth,
 )
-from vdms_rt.ring import Ring, RingClosed
+from vdms_rt.ring import Ring, RingClosed, Slot
 
 READ_TIMEOUT_S = 0.5
 """How long a read may last, so that a stop is prompt."""
-RETRY_S = 1.0
-"""Between two tries to open a source: a replugged device is in use again within two seconds."""
-NO_FRAMES_S = 2.0
-"""Without a frame for so long the state is `no signal`: 60 frame periods are no hiccup."""
-REOPEN_S = 10.0
-"""Without a frame for so long the source is closed and opened: some drivers stall for good when the
-camera is switched off and on."""
 
 
 @dataclass(slots=True)
@@ -67,14 +62,18 @@ class Capture:
         ring: Ring,
         report: Callable[[Event], None],
         on_truth: Callable[[Truth], None],
+        idle: Callable[[], bool],
     ) -> None:
+        """`idle` tells whether nothing is measured yet, so that another device may be used."""
         self.counters = CaptureCounters()
         self._config = config
         self._ring = ring
         self._report = report
         self._on_truth = on_truth
-        self._again = config.source == "v4l2"
+        self._device: Device | None = None
         """A device comes back; a file that cannot be read is not better a second later."""
+        if config.source == "v4l2":
+            self._device = Device(config.v4l2, report, idle)
         self._clock: FrameClock | None = None
         self._clock_for: object = None
         self._exposure_ns = 0
@@ -82,7 +81,6 @@ class Capture:
         self._first_segment = 0
         self._missed_before = 0
         self._last = Tick(-1, 0, 0, 0, 0)
-        self._told = ""
 
     def run(self, stop: threading.Event) -> None:
         """Fill the ring until `stop` is set or the source ends, then close it: the body of the
@@ -90,26 +88,36 @@ class Capture:
         try:
             while not stop.is_set() and not self.counters.ended:
                 self.counters.turns += 1
-                source = self._open(stop)
+                source = self._open()
                 if source is not None:
                     try:
                         self._fill(source, stop)
                     finally:
                         source.close()
+                if self._device is not None:
+                    self._recover(self._device, stop)
         finally:
             self._ring.close()
 
-    def _open(self, stop: threading.Event) -> Source | None:
-        try:
-            source = open_source(self._config, self._on_truth)
-        except SourceError as error:
-            if not self._again:
+    def _recover(self, device: Device, stop: threading.Event) -> None:
+        """Get a device that was closed, or could not be opened, ready to be opened again."""
+        if not device.mend() and device.state in (State.NO_DEVICE, State.LOST, State.STALLED):
+            device.wait(stop)
+
+    def _open(self) -> Source | None:
+        source: Source | None
+        if self._device is not None:
+            source = self._device.open()
+            self.counters.state = self._device.state
+            if source is None:
+                return None
+        else:
+            try:
+                source = open_source(self._config, self._on_truth)
+            except SourceError as error:
                 self.counters.ended = True
                 self.counters.failure = str(error)
                 return None
-            self._tell(State.NO_DEVICE, Severity.ERROR, str(error))
-            stop.wait(RETRY_S)
-            return None
         info = source.info
         self._ring.fit(info.height_px, info.width_px)
         self._fit_clock(info)
@@ -121,14 +129,11 @@ class Capture:
             *info.facts,
         )
         self.counters.info = info
-        self.counters.state = State.STARTING
-        self._told = ""
         text = f"opened {info.name}: " + ", ".join(f"{n} {v}" for n, v in facts[1:4])
         self._report(Event(Severity.INFO, "source", text, facts=facts))
         return source
 
     def _fill(self, source: Source, stop: threading.Event) -> None:
-        silent_s = 0.0
         while not stop.is_set():
             self.counters.turns += 1
             try:
@@ -146,44 +151,56 @@ class Capture:
                 return
             except SourceError as error:
                 self._ring.abandon(slot)
-                self._lost(error)
-                stop.wait(RETRY_S if self._again else 0)
+                self._failed(error)
                 return
+            damage = self._judge(slot.image, grab)
             if grab is None:
                 self._ring.abandon(slot)
-                silent_s += READ_TIMEOUT_S
-                if silent_s >= REOPEN_S:
-                    return
-                if silent_s >= NO_FRAMES_S:
-                    text = (
-                        f"{source.info.name} gives no frames; look whether the camera is on and "
-                        "its cable is in the grabber's chosen input"
-                    )
-                    self._tell(State.NO_SIGNAL, Severity.ERROR, text)
-                continue
-            silent_s = 0.0
-            self.counters.captured += 1
-            if grab.damage is not Damage.NONE:
-                self.counters.damaged += 1
-            self._tell(State.STREAMING, Severity.INFO, f"frames come from {source.info.name}")
-            tick = grab.tick or self._tick(grab)
-            self._ring.commit(
-                slot,
-                Frame(
-                    seq=tick.index,
-                    stamp_ns=grab.stamp_ns,
-                    t_ns=tick.t_ns,
-                    sigma_t_ns=tick.sigma_t_ns,
-                    utc_ns=tick.utc_ns,
-                    segment=tick.segment,
-                    period_ns=self._period_ns(source.info),
-                    image=slot.view,
-                    scan=grab.scan,
-                    damage=grab.damage,
-                    exposure_ns=self._exposure_ns,
-                    order_known=source.info.scan_known,
-                ),
-            )
+            else:
+                self._commit(source, slot, grab, damage)
+            if self._device is not None and self._device.due():
+                return
+
+    def _judge(self, image: Luma, grab: Grab | None) -> Damage:
+        """Return what is wrong with an image, and take the state that it shows."""
+        if self._device is None:
+            self.counters.state = State.STREAMING
+            return grab.damage if grab else Damage.NONE
+        damage = Damage.NONE
+        if grab is None:
+            self._device.silence()
+        else:
+            damage = grab.damage | self._device.frame(image, grab)
+        self.counters.state = self._device.state
+        return damage
+
+    def _commit(self, source: Source, slot: Slot, grab: Grab, damage: Damage) -> None:
+        """Count a frame, give it its time and hand it on."""
+        self.counters.captured += 1
+        if damage & (Damage.FLAGGED | Damage.SHORT):
+            self.counters.damaged += 1
+        elif damage & Damage.NO_SIGNAL:
+            self.counters.no_signal += 1
+        elif damage & Damage.REPEATED:
+            self.counters.repeated += 1
+        tick = grab.tick or self._tick(grab)
+        self._ring.commit(
+            slot,
+            Frame(
+                seq=tick.index,
+                stamp_ns=grab.stamp_ns,
+                t_ns=tick.t_ns,
+                sigma_t_ns=tick.sigma_t_ns,
+                utc_ns=tick.utc_ns,
+                segment=tick.segment,
+                period_ns=self._period_ns(source.info),
+                image=slot.view,
+                scan=grab.scan,
+                damage=damage,
+                exposure_ns=self._exposure_ns,
+                order_known=source.info.scan_known,
+            ),
+        )
 
     def _fit_clock(self, info: SourceInfo) -> None:
         """Keep the clock for a source that comes back as it was; else go on with a new one."""
@@ -223,16 +240,10 @@ class Capture:
         shown = self._clock.period_ns if self._clock is not None and self._last.index >= 0 else None
         return round(info.frame_period_s * 1_000_000_000 if shown is None else shown)
 
-    def _lost(self, error: SourceError) -> None:
-        if not self._again:
+    def _failed(self, error: SourceError) -> None:
+        if self._device is None:
             self.counters.ended = True
             self.counters.failure = str(error)
             return
-        self._tell(State.LOST, Severity.ERROR, str(error))
-
-    def _tell(self, state: State, severity: Severity, text: str) -> None:
-        """Enter a state and say so, once for each sentence."""
-        self.counters.state = state
-        if text != self._told:
-            self._told = text
-            self._report(Event(severity, "state", text, facts=(("state", state.value),)))
+        self._device.failed(error)
+        self.counters.state = self._device.state

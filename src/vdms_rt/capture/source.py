@@ -1,4 +1,4 @@
-"""The one protocol of everything that gives frames, and the choice between its four kinds."""
+"""The one protocol of everything that gives frames, and the choice of those without a driver."""
 
 from __future__ import annotations
 
@@ -29,16 +29,13 @@ class Source(Protocol):
 
 
 def open_source(config: Config, on_truth: Callable[[Truth], None]) -> Source:
-    """Return the source that the configuration names, open and streaming.
+    """Return the file or table that the configuration names, open and streaming; a grabber is
+    opened by `capture.device`.
 
     `on_truth` is called in the reading thread, before `read` returns, with every marker's true
     position, by a source that knows it. Raises SourceError with a sentence for the person.
     """
     match config.source:
-        case "v4l2":
-            from vdms_rt.capture.v4l2 import V4l2Source
-
-            return V4l2Source(config.v4l2)
         case "clip":
             from vdms_rt.capture.clip import ClipSource
 
@@ -47,7 +44,7 @@ def open_source(config: Config, on_truth: Callable[[Truth], None]) -> Source:
             from vdms_rt.capture.log import LogSource
 
             return LogSource(config.log)
-        case "table":
+        case _:
             from vdms_rt.capture.table import TableSource
 
             return TableSource(config.table, [m.shape for m in config.marker], on_truth)

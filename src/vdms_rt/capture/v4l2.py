@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vdms_rt.capture import v4l2_api as api
-from vdms_rt.capture.grabber import choose_device
+from vdms_rt.capture.grabber import DeviceInfo, choose_device
+from vdms_rt.capture.signal import DriverSignal, driver_signal
 from vdms_rt.capture.v4l2_luma import Part, decode_mjpg
-from vdms_rt.capture.v4l2_settings import Node, agree
+from vdms_rt.capture.v4l2_node import Node
+from vdms_rt.capture.v4l2_settings import agree
 from vdms_rt.config import V4l2
 from vdms_rt.model import Damage, Grab, Luma, Scan, SourceError, SourceInfo, StampEvent
 
@@ -31,23 +33,34 @@ class V4l2Source:
 
     Raises SourceError with the sentence for the person, and then holds nothing. `field`, a
     V4L2_FIELD_*, is the arrangement of fields that the driver is asked for; what it answers counts.
+    `device` is the one to open, by default what the configuration means.
     """
 
-    def __init__(self, config: V4l2, field: int = api.FIELD_INTERLACED) -> None:
+    def __init__(
+        self,
+        config: V4l2,
+        field: int = api.FIELD_INTERLACED,
+        device: DeviceInfo | None = None,
+    ) -> None:
+        self.device = device or choose_device(config.device)
+        self._input = config.input
         self._maps: list[mmap.mmap] = []
         self._bytes: list[NDArray[np.uint8]] = []
         self._parts: list[tuple[Part, ...]] = []
         self._buffer = api.Buffer(type=api.BUF_TYPE_VIDEO_CAPTURE, memory=api.MEMORY_MMAP)
         self._stream = c_int(api.BUF_TYPE_VIDEO_CAPTURE)
-        self._node = Node(choose_device(config.device))
+        self._node = Node(self.device.node)
         try:
             settings = agree(self._node, config, field)
             self._layout = settings.layout
+            self.standard = settings.standard
             flags = self._map_buffers(config.buffers)
             self._node.call(api.VIDIOC_STREAMON, self._stream, "starting to stream")
         except BaseException:
             self.close()
             raise
+        # The first buffer may begin within a frame (usbtv) or be from before (v4l2loopback).
+        self._to_skip = 2 if self._layout.field == api.FIELD_ALTERNATE else 1
         self._poll = select.poll()
         self._poll.register(self._node.fd, select.POLLIN)
         clock = flags & api.BUF_FLAG_TIMESTAMP_MASK
@@ -78,11 +91,21 @@ class V4l2Source:
                 ("stamps", stamps),
                 ("buffers", str(len(self._maps))),
             ),
+            warnings=settings.warnings,
         )
 
     @property
     def info(self) -> SourceInfo:
         return self._info
+
+    @property
+    def lossy(self) -> bool:
+        """Pictures come compressed, so that two may be the same though time went on."""
+        return self._layout.pixel_format == "MJPG"
+
+    def signal(self) -> DriverSignal:
+        """Return the driver's word on the signal at the input."""
+        return driver_signal(self._node.fd, self._input)
 
     def read(self, out: Luma, timeout_s: float) -> Grab | None:
         assert out.shape == (self._layout.height_px, self._layout.width_px)
@@ -91,8 +114,11 @@ class V4l2Source:
         while True:
             events = self._poll.poll(int(left_s * 1000))
             if events and self._dequeue():
-                break
-            if events and events[0][1] & _GONE:
+                if not self._to_skip:
+                    break
+                self._to_skip -= 1
+                self._give_back()
+            elif events and events[0][1] & _GONE:
                 raise SourceError(
                     f"{self._node.name} stopped giving pictures; check the cables and plug it in "
                     "anew"
@@ -106,7 +132,7 @@ class V4l2Source:
             stamp = buffer.timestamp
             stamp_ns = stamp.tv_sec * 1_000_000_000 + stamp.tv_usec * 1000
         grab = Grab(stamp_ns, buffer.sequence, self._scan(), self._copy(out))
-        self._node.call(api.VIDIOC_QBUF, buffer, "giving a buffer back")
+        self._give_back()
         return grab
 
     def close(self) -> None:
@@ -146,13 +172,16 @@ class V4l2Source:
                     offset=buffer.offset,
                 )
             except OSError as error:
-                raise SourceError(self._node.sentence(error, "mapping a buffer")) from None
+                raise self._node.error(error, "mapping a buffer") from None
             self._maps.append(one)
             self._bytes.append(np.frombuffer(one, np.uint8))
             if self._layout.pixel_format != "MJPG":
                 self._parts.append(self._layout.parts(one))
             self._node.call(api.VIDIOC_QBUF, buffer, "queueing a buffer")
         return buffer.flags
+
+    def _give_back(self) -> None:
+        self._node.call(api.VIDIOC_QBUF, self._buffer, "giving a buffer back")
 
     def _dequeue(self) -> bool:
         """Take the next filled buffer; False if there is none yet."""
@@ -161,7 +190,7 @@ class V4l2Source:
         except OSError as error:
             if error.errno == errno.EAGAIN:
                 return False
-            raise SourceError(self._node.sentence(error, "giving a picture")) from None
+            raise self._node.error(error, "giving a picture") from None
         return True
 
     def _copy(self, out: Luma) -> Damage:

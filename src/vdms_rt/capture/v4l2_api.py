@@ -39,6 +39,25 @@ BUF_FLAG_TSTAMP_SRC_SOE = 0x00010000
 
 FRMIVAL_TYPE_DISCRETE = 1
 
+IN_ST_NO_POWER = 0x00000001
+IN_ST_NO_SIGNAL = 0x00000002
+IN_ST_NO_H_LOCK = 0x00000100
+IN_ST_NO_V_LOCK = 0x00000400
+IN_ST_NO_SYNC = 0x00010000
+
+CID_BRIGHTNESS = 0x00980900
+CID_CONTRAST = 0x00980901
+CID_SATURATION = 0x00980902
+CID_HUE = 0x00980903
+CID_AUTOGAIN = 0x00980912
+CID_GAIN = 0x00980913
+CID_AUTOBRIGHTNESS = 0x00980920
+CID_EXPOSURE_AUTO = 0x009A0901
+EXPOSURE_MANUAL = 1
+
+CTRL_FLAG_DISABLED = 0x0001
+CTRL_FLAG_READ_ONLY = 0x0004
+
 STD_525_60 = 0x0000F900
 STD_625_50 = 0x00FF06FF
 
@@ -188,6 +207,7 @@ class Input(Structure):
     index: int
     name: bytes
     std: int
+    status: int
     _fields_ = (
         ("index", c_uint32),
         ("name", c_char * 32),
@@ -199,6 +219,35 @@ class Input(Structure):
         ("capabilities", c_uint32),
         ("reserved", c_uint32 * 3),
     )
+
+
+class ControlDescription(Structure):
+    """`v4l2_queryctrl`"""
+
+    id: int
+    name: bytes
+    minimum: int
+    maximum: int
+    step: int
+    default_value: int
+    flags: int
+    _fields_ = (
+        ("id", c_uint32),
+        ("type", c_uint32),
+        ("name", c_char * 32),
+        ("minimum", c_int32),
+        ("maximum", c_int32),
+        ("step", c_int32),
+        ("default_value", c_int32),
+        ("flags", c_uint32),
+        ("reserved", c_uint32 * 2),
+    )
+
+
+class Control(Structure):
+    id: int
+    value: int
+    _fields_ = (("id", c_uint32), ("value", c_int32))
 
 
 class Fraction(Structure):
@@ -266,6 +315,10 @@ VIDIOC_STREAMON = _request(_WRITE, 18, _INT)
 VIDIOC_STREAMOFF = _request(_WRITE, 19, _INT)
 VIDIOC_G_PARM = _request(_READ | _WRITE, 21, ctypes.sizeof(StreamParameters))
 VIDIOC_S_STD = _request(_WRITE, 24, _STD)
+VIDIOC_G_CTRL = _request(_READ | _WRITE, 27, ctypes.sizeof(Control))
+VIDIOC_S_CTRL = _request(_READ | _WRITE, 28, ctypes.sizeof(Control))
+VIDIOC_QUERYCTRL = _request(_READ | _WRITE, 36, ctypes.sizeof(ControlDescription))
+VIDIOC_G_INPUT = _request(_READ, 38, _INT)
 VIDIOC_ENUMINPUT = _request(_READ | _WRITE, 26, ctypes.sizeof(Input))
 VIDIOC_S_INPUT = _request(_READ | _WRITE, 39, _INT)
 VIDIOC_QUERYSTD = _request(_READ, 63, _STD)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import errno
-import os
 from ctypes import c_int, c_uint64
 from dataclasses import dataclass
 from fractions import Fraction
 
 from vdms_rt.capture import v4l2_api as api
-from vdms_rt.capture.grabber import PIXEL_FORMATS, busy_sentence, open_sentence
+from vdms_rt.capture.controls import set_controls
+from vdms_rt.capture.grabber import PIXEL_FORMATS
 from vdms_rt.capture.v4l2_luma import PixelLayout
+from vdms_rt.capture.v4l2_node import Node
 from vdms_rt.config import V4l2
 from vdms_rt.model import NTSC_FRAME_PERIOD_S, PAL_FRAME_PERIOD_S, Scan, SourceError
 
@@ -25,84 +25,6 @@ FIRST_FIELD_HABIT = {
 _SINGLE_STANDARDS = ("ntsc-m", "ntsc-m-jp", "ntsc-m-kr", "ntsc-443", "pal-m", "pal-60")
 
 
-class Node:
-    """An open video node, which turns the kernel's errors into sentences."""
-
-    def __init__(self, path: str) -> None:
-        """Raises SourceError if there is no such node, or it gives no pictures."""
-        self.path = path
-        self.name = path
-        try:
-            self.fd = api.open_node(path)
-        except OSError as error:
-            raise SourceError(open_sentence(path, error)) from None
-        try:
-            about = self._about()
-        except BaseException:
-            self.close()
-            raise
-        self.driver = api.text(about.driver)
-        self.card = api.text(about.card)
-        self.bus = api.text(about.bus_info)
-        self.name = f"{path} ({self.card})"
-
-    def call(self, request: int, argument: api.Argument, doing: str) -> None:
-        """Ask the driver, which fills `argument`; raises SourceError. `doing` names the attempt."""
-        try:
-            api.ioctl(self.fd, request, argument)
-        except OSError as error:
-            raise SourceError(self.sentence(error, doing)) from None
-
-    def offers(self, request: int, argument: api.Argument, doing: str) -> bool:
-        """Ask the driver as `call` does; False if it has no such thing."""
-        try:
-            api.ioctl(self.fd, request, argument)
-        except OSError as error:
-            if error.errno in api.NOT_OFFERED:
-                return False
-            raise SourceError(self.sentence(error, doing)) from None
-        return True
-
-    def sentence(self, error: OSError, doing: str) -> str:
-        """Return what an error of the driver's means and how to mend it."""
-        if error.errno in (errno.ENODEV, errno.ENXIO):
-            return f"{self.name} was unplugged; plug it in again"
-        if error.errno == errno.EBUSY:
-            return busy_sentence(self.name)
-        if error.errno == errno.ENOSPC:
-            return (
-                f"the USB bus has no room for the pictures of {self.name}; plug it into a port of "
-                "its own, without a hub"
-            )
-        return (
-            f"{self.name} failed while {doing}: {os.strerror(error.errno or 0)}; check the cables "
-            "and plug it in anew"
-        )
-
-    def close(self) -> None:
-        """Give the node back; may be called twice."""
-        if self.fd >= 0:
-            os.close(self.fd)
-            self.fd = -1
-
-    def _about(self) -> api.Capability:
-        try:
-            about = api.capability(self.fd)
-        except OSError as error:
-            if error.errno in api.NOT_OFFERED:
-                raise SourceError(
-                    f"{self.path} is not a video device; set v4l2.device to a node that "
-                    "`vdms-rt devices` lists"
-                ) from None
-            raise SourceError(self.sentence(error, "being asked what it is")) from None
-        if not about.of_node & api.CAP_VIDEO_CAPTURE or not about.of_node & api.CAP_STREAMING:
-            raise SourceError(
-                f"{self.path} ({api.text(about.card)}) is not a capture device that streams; set "
-                "v4l2.device to one that `vdms-rt devices` lists with its formats"
-            )
-        return about
-
-
 @dataclass(frozen=True, slots=True)
 class Settings:
     """What the driver agreed to."""
@@ -111,11 +33,14 @@ class Settings:
     scan: Scan
     scan_known: bool
     frame_period_s: Fraction
+    standard: str
+    """By its name in the configuration; empty where there is none."""
     facts: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
 
 
 def agree(node: Node, config: V4l2, field: int) -> Settings:
-    """Set input, standard and format, in this order, and return what the driver made of them.
+    """Set input, standard, format and controls, in this order; return what the driver made of it.
 
     `field` is the V4L2_FIELD_* to ask for. Raises SourceError. Nothing is changed on a device that
     another program has in use. Standards are refused once there are buffers, so this comes first.
@@ -128,6 +53,7 @@ def agree(node: Node, config: V4l2, field: int) -> Settings:
     layout = _set_format(node, config, standard, field)
     scan, known = _scan(node, layout, standard, config.field_order)
     period_s, period_fact = _frame_period(node, layout, standard)
+    adjusted, warnings = set_controls(node, config)
     size = f"{layout.width_px}x{layout.height_px}"
     order = scan.name.lower().replace("_", " ") if scan != Scan.TOP else "one field an image"
     facts = (
@@ -136,8 +62,10 @@ def agree(node: Node, config: V4l2, field: int) -> Settings:
         ("format", f"{layout.pixel_format} {size}"),
         ("fields", order if known else f"{order} by habit of the driver"),
         ("frame period", period_fact),
+        *adjusted,
     )
-    return Settings(layout, scan, known, period_s, facts)
+    name = standard_fact.split(",")[0] if standard else ""
+    return Settings(layout, scan, known, period_s, name, facts, warnings)
 
 
 def _set_input(node: Node, index: int) -> tuple[int, str]:
@@ -194,7 +122,7 @@ def _set_format(node: Node, config: V4l2, standard: int, field: int) -> PixelLay
     try:
         offered = api.pixel_formats(node.fd)
     except OSError as error:
-        raise SourceError(node.sentence(error, "listing its formats")) from None
+        raise node.error(error, "listing its formats") from None
     wanted = PIXEL_FORMATS if config.pixel_format == "auto" else (config.pixel_format,)
     size = (config.width_px, config.height_px or (576 if standard & api.STD_625_50 else 480))
     others: list[PixelLayout] = []

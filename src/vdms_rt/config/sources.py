@@ -20,6 +20,14 @@ class V4l2(Section):
     width_px: int = Field(default=720, ge=16, le=4096)
     height_px: int = Field(default=0, ge=0, le=4096)
     """0: what the standard has."""
+    brightness: int | None = None
+    contrast: int | None = None
+    saturation: int | None = None
+    hue: int | None = None
+    gain: int | None = None
+    """The device's own numbers; None leaves them as they are."""
+    automatic: Literal["off", "leave"] = "off"
+    """Automatic gain, brightness and exposure."""
     buffers: int = Field(default=8, ge=2, le=32)
     field_order: Literal["auto", "progressive", "top-first", "bottom-first"] = "auto"
 
