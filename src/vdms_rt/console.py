@@ -6,8 +6,12 @@ import logging
 import os
 import shutil
 import sys
+import textwrap
 
 ERASE_TO_END = "\x1b[K"
+
+TIME_COLUMNS = 9
+"""Of the time before a log line, and of what goes on under it."""
 
 _PRIORITIES = {logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 """Of the journal, sd-daemon(3)."""
@@ -50,6 +54,8 @@ class Console(logging.Handler):
         if self._journal:
             prefix = f"<{_PRIORITIES.get(record.levelno, 6)}>"
             text = "\n".join(prefix + line for line in text.splitlines())
+        if self._terminal:
+            text = wrapped(text, shutil.get_terminal_size().columns)
         erase = f"\r{ERASE_TO_END}" if self._line else ""
         sys.stderr.write(f"{erase}{text}\n{self._line}")
         sys.stderr.flush()
@@ -72,3 +78,19 @@ class Console(logging.Handler):
         self.status("")
         sys.stderr.write(text + "\n")
         sys.stderr.flush()
+
+
+def wrapped(text: str, columns: int) -> str:
+    """Return the text with its long lines broken at spaces, as far as words allow."""
+    return "\n".join(
+        part
+        for line in text.splitlines()
+        for part in textwrap.wrap(
+            line,
+            max(columns - 1, 2 * TIME_COLUMNS),
+            subsequent_indent=" " * TIME_COLUMNS,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        or [""]
+    )
