@@ -93,6 +93,8 @@ def test_a_run_ends_by_itself_with_its_summary(
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     assert "reference taken from 60 pictures" in done.stderr
+    assert "\nmarker m1\n  scale       1.56" in done.stderr
+    assert "\n  resolution  0.9 um in x, 0.9 um in y, one sigma a sample\n" in done.stderr
     assert str(recording) in done.stderr.splitlines()[-1]
 
 
@@ -162,7 +164,10 @@ def test_the_recording_tells_all_about_itself(
     (end,) = messages(demo[1], "end")
     assert end.reason == "the time was up"
     assert end.health.measured > 100
-    assert [s.revision for s in messages(demo[1], "setup")] == [1, 2]
+    set_ups = list(messages(demo[1], "setup"))
+    assert [s.revision for s in set_ups] == [1, 2]
+    assert [(a.marker, a.focus, list(a.advice)) for a in set_ups[1].aims] == [("m1", "sharp", [])]
+    assert set_ups[1].aims[0].scale_x_px_per_mm == pytest.approx(1.56, rel=0.01)
     assert {"source", "marker-found", "reference", "field-order"} <= {
         e.code for e in messages(demo[1], "event")
     }
