@@ -63,7 +63,7 @@ lock: $(VENV)/dev.stamp ## write requirements/*.txt anew
 	  ../$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-emit-package vdms-rt --constraint dev.txt --all-extras ../tools/replay/pyproject.toml build.in -o replay.txt
 
 proto: $(VENV)/dev.stamp ## compile wire/*.proto
-	@PATH=$(BIN):$$PATH $(BIN)/python -m grpc_tools.protoc -I src --python_out=src --mypy_out=src src/vdms_rt/wire/vdms.proto src/vdms_rt/wire/control.proto
+	@PATH=$(BIN):$$PATH $(BIN)/python -m grpc_tools.protoc -I src --python_out=src --mypy_out=src src/vdms_rt/wire/vdms.proto src/vdms_rt/wire/control.proto src/vdms_rt/wire/picture.proto
 
 clean: ## remove what was built and installed
 	@rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .lint-imports.log

@@ -139,7 +139,10 @@ class Outlet:
         self.newest_set_up_message = message
         self._say(topics.SETUP, "", self.now_ns(), message.SerializeToString())
         if self.recorder is not None:
-            self.recorder.attach("reference.png", "image/png", codec.png(image))
+            png = codec.png(image)
+            self.recorder.attach("reference.png", "image/png", png)
+            now_ns = self.now_ns()
+            self._say(topics.PICTURE, "", now_ns, convert.picture_bytes(png, now_ns, self._station))
 
     def checkpoint(self, picture: Picture, revision: int, text: str) -> None:
         """Log where measuring stands just before a picture."""

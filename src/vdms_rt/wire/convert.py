@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from vdms_rt.model import (
     Aim,
@@ -22,6 +23,7 @@ from vdms_rt.model import (
     Status,
     Truth,
 )
+from vdms_rt.wire import picture_pb2
 from vdms_rt.wire import vdms_pb2 as pb
 
 RAW8 = "raw8"
@@ -204,6 +206,17 @@ def health_from(data: bytes) -> Health:
     values = {name: getattr(m, name) for name in Health.__dataclass_fields__}
     values["state"] = State(m.state)
     return Health(**values)
+
+
+def picture_bytes(png: bytes, at_ns: int, station: str) -> bytes:
+    """Return a PNG as a serialised `foxglove.CompressedImage`."""
+    seconds, nanos = divmod(at_ns, 1_000_000_000)
+    return picture_pb2.CompressedImage(
+        timestamp=Timestamp(seconds=seconds, nanos=nanos),
+        data=png,
+        format="png",
+        frame_id=station,
+    ).SerializeToString()
 
 
 def pixels_bytes(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from google.protobuf.message import Message
 
+from vdms_rt.wire import picture_pb2
 from vdms_rt.wire import vdms_pb2 as pb
 
 
@@ -94,6 +95,15 @@ PIXELS = Topic(
     recorded=True,
 )
 
+PICTURE = Topic(
+    "picture",
+    "vdms/{station}/picture",
+    picture_pb2.CompressedImage,
+    "",
+    "with each set-up",
+    network=False,
+    recorded=True,
+)
 CHECKPOINT = Topic(
     "checkpoint",
     "vdms/{station}/checkpoint",
@@ -104,7 +114,7 @@ CHECKPOINT = Topic(
     recorded=True,
 )
 
-TOPICS = (DISPLACEMENT, TRUTH, HEALTH, EVENT, SETUP, RUN, END, PIXELS, CHECKPOINT)
+TOPICS = (DISPLACEMENT, TRUTH, HEALTH, EVENT, SETUP, RUN, END, PIXELS, PICTURE, CHECKPOINT)
 
 ALIVE_KEY = "vdms/{station}/alive"
 """Liveliness token of a running daemon; it says that the process lives, not that it measures."""
