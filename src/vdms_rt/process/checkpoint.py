@@ -4,6 +4,7 @@ the same numbers, bit for bit."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import ClassVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -88,6 +89,10 @@ def checkpoint(progress: Progress) -> str:
     return _TEXT.dump_json(value).decode()
 
 
+_watches_of = lru_cache(maxsize=8)(watches_of)
+"""Many checkpoints stand against one set-up, and what follows from it costs tens of frames."""
+
+
 def resumed(text: str, set_up: SetUp | None, session: int) -> Progress:
     """Return the run that `checkpoint` described; `set_up` was in force then.
 
@@ -102,7 +107,7 @@ def resumed(text: str, set_up: SetUp | None, session: int) -> Progress:
             f"the set-up of revision {value.revision} stands in no readable part of the recording"
         )
     watches = (
-        watches_of(set_up, value.plan, value.exposure_ns, value.period_ns)
+        _watches_of(set_up, value.plan, value.exposure_ns, value.period_ns)
         if set_up is not None and value.watched
         else ()
     )

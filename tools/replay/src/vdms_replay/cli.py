@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 import vdms_replay
-from vdms_replay import compare, export, info, play, recover
+from vdms_replay import compare, export, info, play, recover, reprocess
 from vdms_rt.model import VdmsError
 
 EXIT_DONE = 0
@@ -20,6 +20,7 @@ VERBS = (
     info,
     recover,
     play,
+    reprocess,
     export,
     compare,
 )
