@@ -50,7 +50,7 @@ def test_times_and_what_they_cost() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_still_marker_has_no_line_at_half_the_rate_of_its_fields(seed: int) -> None:
+def test_the_line_of_a_still_marker_is_its_references_own_noise(seed: int) -> None:
     record = run(Case(7.0, seed=seed, motion="still"))
     assert len(record.seq) > 300
     # Of 30 stills each, the fields' references leave no more than their own noise of it.

@@ -222,10 +222,16 @@ def lower_edge(
         width_ns = math.exp((known[1] * math.log(known[0]) + k * math.log(above_ns)) / weight)
     # Not even the density is known when stamps are few; and where it goes on to rise above the
     # earliest ones, what looks like an edge may be the beginning of a slope.
+    vague = 1 + 3 / weight
     tenth, median = np.quantile(residual, (0.1, 0.5))
     soft_ns = 2 * max(0.0, float(tenth) - float(median) * (0.2 + 1 / math.sqrt(n)))
-    var_level = line.var_level + 3 / weight * gap_ns**2 + soft_ns**2
-    return dataclasses.replace(line, var_level=var_level), width_ns
+    line = dataclasses.replace(
+        line,
+        var_level=vague * line.var_level + soft_ns**2,
+        cov=vague * line.cov,
+        var_slope=vague * line.var_slope,
+    )
+    return line, width_ns
 
 
 def independent(residual: Floats) -> float:
