@@ -94,7 +94,7 @@ def test_a_run_ends_by_itself_with_its_summary(
     assert "Traceback" not in done.stderr
     assert "reference taken from 60 pictures" in done.stderr
     assert "\nmarker m1\n  scale       1.56" in done.stderr
-    assert "\n  resolution  0.9 um in x, 0.9 um in y, one sigma a sample\n" in done.stderr
+    assert "\n  resolution  0.9 um in x, 0.9 um in y (one sigma of a sample)\n" in done.stderr
     assert str(recording) in done.stderr.splitlines()[-1]
 
 
