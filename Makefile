@@ -10,7 +10,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test quick check rig lock proto clean
+.PHONY: help demo test quick check soak rig install uninstall wheels lock proto clean
 
 help: ## list these
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -47,13 +47,25 @@ check: $(VENV)/replay.stamp ## format, lint, types, layers
 	@echo "check: clean"
 
 test: check ## everything that runs without a kernel of its own
-	@$(BIN)/pytest -m "not rig"
+	@$(BIN)/pytest -m "not rig and not soak"
 
 quick: $(VENV)/replay.stamp ## the fast tests alone
-	@$(BIN)/pytest -q -m "not rig and not slow"
+	@$(BIN)/pytest -q -m "not rig and not slow and not soak"
 
-rig: $(VENV)/dev.stamp ## the tests on real kernel drivers, in a virtual machine
-	@tests/rig/run
+soak: $(VENV)/dev.stamp ## the long tests: faults many times over (as root, or some are skipped)
+	@$(BIN)/pytest -m "soak and not rig"
+
+rig: $(VENV)/dev.stamp ## the tests on real kernel drivers, in a virtual machine (DEVICE=...: on that grabber)
+	@$(if $(DEVICE),$(BIN)/pytest -s -m "hardware and not soak" --device $(DEVICE) tests/rig,tests/rig/run)
+
+install: ## the service, with sudo (WHEELS=DIR: without internet, see docs/guide.md)
+	@systemd/install.sh
+
+uninstall: ## remove the service again; recordings and configuration stay
+	@systemd/uninstall.sh
+
+wheels: ## fetch what an installation without internet needs, into WHEELS=DIR
+	@WHEELS=$(or $(WHEELS),wheels) systemd/install.sh wheels
 
 lock: $(VENV)/dev.stamp ## write requirements/*.txt anew
 	@$(BIN)/pip install --quiet uv

@@ -2,7 +2,8 @@
 # Run a command in a virtual machine that boots Debian's own kernel, with its video and USB
 # drivers, over this machine's root file system (read-only, a tmpfs above it).
 #
-#   vm.sh [-t SECONDS] [-o DIR] [--] COMMAND [ARG...]
+#   vm.sh [-s] [-t SECONDS] [-o DIR] [--] COMMAND [ARG...]
+#     -s           boot systemd, with udev and the journal; else nothing runs but the command
 #     -t SECONDS   limit for the whole run (600)
 #     -o DIR       host folder, writable in the guest as /mnt/out; console.log goes there too
 #
@@ -19,8 +20,10 @@ cache=${VDMS_RIG_CACHE:-/var/cache/vdms-rig}
 accel=${VDMS_RIG_ACCEL:-tcg,thread=multi}
 limit_s=600
 out=
+init=command
 while [ $# -gt 0 ]; do
     case $1 in
+        -s) init=systemd; shift ;;
         -t) limit_s=$2; shift 2 ;;
         -o) out=$2; shift 2 ;;
         --) shift; break ;;
@@ -40,7 +43,7 @@ quietly() {
 
 prepare() {
     local missing=() package image
-    for package in qemu-system-x86 kmod cpio busybox-static v4l-utils usbip; do
+    for package in qemu-system-x86 kmod cpio busybox-static v4l-utils usbip udev systemd-sysv; do
         dpkg-query -Wf '${db:Status-Status}' "$package" 2>/dev/null | grep -qx installed ||
             missing+=("$package")
     done
@@ -117,7 +120,10 @@ $b mkdir -p /root/mnt/out /root/usr/lib/modules
 # Without a cache, for both sides to see each other's files at once.
 $b mount -t 9p -o rw,$options,cache=none out /root/mnt/out
 for word in $($b cat /proc/cmdline); do
-    case $word in rig.modules=*) modules=${word#rig.modules=} ;; esac
+    case $word in
+        rig.modules=*) modules=${word#rig.modules=} ;;
+        rig.init=*) init=${word#rig.init=} ;;
+    esac
 done
 $b mount -t tmpfs tmpfs /root/usr/lib/modules
 $b ln -s "$modules" /root/usr/lib/modules/
@@ -125,6 +131,36 @@ $b rm -rf /root/run
 $b mkdir /root/run
 $b mount -t tmpfs -o mode=755 tmpfs /root/run
 for directory in proc sys dev; do $b mount -o move /$directory /root/$directory; done
+if [ "$init" = systemd ]; then
+    # With this file there it takes the guest for a container, and does not read its command line.
+    $b rm -f /root/.dockerenv
+    # Of this machine's own services nothing is started, and its /tmp is left alone.
+    units=/root/etc/systemd/system
+    $b rm -rf $units/*.wants
+    for unit in apt-daily apt-daily-upgrade dpkg-db-backup e2scrub_all fstrim man-db; do
+        $b ln -sf /dev/null $units/$unit.timer
+    done
+    for unit in systemd-firstboot systemd-pstore systemd-networkd-wait-online; do
+        $b ln -sf /dev/null $units/$unit.service
+    done
+    : >/root/etc/fstab
+    $b ln -sf /dev/null /root/etc/tmpfiles.d/tmp.conf
+    [ -s /root/etc/machine-id ] || echo 0123456789abcdef0123456789abcdef >/root/etc/machine-id
+    {
+        echo '[Unit]'
+        echo 'Requires=basic.target rig.service'
+        echo 'After=basic.target'
+        echo 'AllowIsolate=yes'
+    } >$units/rig.target
+    {
+        echo '[Unit]'
+        echo 'Wants=basic.target'
+        echo 'After=basic.target'
+        echo '[Service]'
+        echo 'ExecStart=/bin/bash /mnt/out/guest.sh'
+    } >$units/rig.service
+    exec $b switch_root /root /lib/systemd/systemd
+fi
 $b mkdir -p /root/dev/pts /root/dev/shm
 $b mount -t devpts devpts /root/dev/pts
 $b mount -t tmpfs tmpfs /root/dev/shm
@@ -171,7 +207,7 @@ qemu-system-x86_64 -accel "$accel" -cpu "$cpu" -M q35,sata=off,smbus=off,vmport=
     -fsdev local,id=out,path="$out",security_model=none,multidevs=remap \
     -device virtio-9p-pci,fsdev=out,mount_tag=out \
     -kernel "$cache/root/boot/vmlinuz-$version" -initrd "$work/initrd.gz" \
-    -append "console=ttyS0 quiet loglevel=4 panic=-1 mitigations=off $kernel_options rig.modules=$cache/root/lib/modules/$version" \
+    -append "console=ttyS0 quiet loglevel=4 panic=-1 mitigations=off $kernel_options rig.modules=$cache/root/lib/modules/$version rig.init=$init systemd.unit=rig.target systemd.show_status=0" \
     </dev/null 2>"$out/qemu.log" &
 qemu_pid=$!
 end=$((SECONDS + limit_s))
