@@ -51,7 +51,8 @@ def aim_lines(aim: Aim) -> list[str]:
         (
             "resolution",
             f"{'at best ' if aim.saturated_percent > SATURATED_PERCENT else ''}"
-            f"{_length(aim.sigma_x_mm)} in x, {_length(aim.sigma_y_mm)} in y (one sigma of a sample)",
+            f"{_length(aim.sigma_x_mm)} in x, {_length(aim.sigma_y_mm)} in y "
+            "(one sigma of a sample)",
         ),
         (
             "room",
