@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tools.bench.clock import (
+    AGES,
     DRIVERS,
     EXPOSURE_NS,
     START_NS,
@@ -111,10 +112,6 @@ def test_slow_source_and_pal() -> None:
     assert ticks.clock.figures.rate_ppm == pytest.approx(-200, abs=2)
 
 
-AGES = [slice(8, 30), slice(30, 60), slice(60, 150), slice(150, 450), slice(450, 900)]
-"""Images since the first: the first quarter of a second aside, up to half a minute."""
-
-
 @pytest.mark.parametrize(
     "driver",
     [
@@ -132,8 +129,10 @@ def test_sigma_is_true_at_every_age(driver: Driver) -> None:
     square, inside = np.zeros((2, 40, len(AGES)))
     for seed in range(40):
         ticks = follow(simulate(driver, 920, seed), grabber())
-        square[seed] = [np.mean((ticks.error_ns[a] / ticks.sigma_ns[a]) ** 2) for a in AGES]
-        inside[seed] = [inside_two_sigma(ticks, age) for age in AGES]
+        square[seed] = [
+            np.mean((ticks.error_ns[a] / ticks.sigma_ns[a]) ** 2) for a in AGES.values()
+        ]
+        inside[seed] = [inside_two_sigma(ticks, age) for age in AGES.values()]
     rms = np.sqrt(square.mean(axis=0))
     # 40 sources tell each to 0.2 or so. Half a microsecond that quartz may leave is not simulated.
     assert (rms > 0.45).all()
@@ -150,23 +149,19 @@ def test_sigma_is_true_of_stamps_without_an_edge() -> None:
     for seed in range(12):
         ticks = follow(simulate(DRIVERS["1 ms normal"], 2400, seed), grabber())
         about_ns = ticks.error_ns - ticks.error_ns[1500:].mean()
-        inside.append([np.mean(np.abs(about_ns[a]) <= 2 * ticks.sigma_ns[a]) for a in AGES[2:]])
+        inside.append(
+            [np.mean(np.abs(about_ns[a]) <= 2 * ticks.sigma_ns[a]) for a in [*AGES.values()][2:]]
+        )
     assert (np.mean(inside, axis=0) > [0.6, 0.85, 0.9]).all()
 
 
 def test_sigma_is_true_under_load() -> None:
     """Lateness comes in waves of a second: fewer stamps count than there are."""
 
-    def waves(random: np.random.Generator, n: int) -> np.ndarray:
-        load = np.zeros(n)
-        for i, push in enumerate(random.normal(size=n - 1)):
-            load[i + 1] = 0.98 * load[i] + 0.2 * push
-        return random.uniform(0, 0.5e6, n) * np.exp(load)
-
     inside = []
     for seed in range(12):
-        ticks = follow(simulate(Driver(waves), 2400, seed), grabber())
-        inside.append([inside_two_sigma(ticks, age) for age in (*AGES, slice(900, 2400))])
+        ticks = follow(simulate(DRIVERS["load in waves, 0.5 ms"], 2400, seed), grabber())
+        inside.append([inside_two_sigma(ticks, age) for age in (*AGES.values(), slice(900, 2400))])
     assert (np.mean(inside, axis=0) > 0.87).all()
 
 

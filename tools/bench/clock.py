@@ -4,7 +4,8 @@ Every driver stamps a camera whose quartz is off, late and with frames lost with
 sequence. The table says how far the clock's times are from the truth after the first minute, beside
 a constant delay and with that delay; how many of them lie within two of its own standard
 deviations; whether it counted every lost frame; what a two-sided refit leaves of the whole record;
-and what one tick costs.
+and what one tick costs. A second table says the same of the first half minute, by age: error, and
+error over sigma, which is 1 where sigma is true.
 """
 
 from __future__ import annotations
@@ -106,6 +107,18 @@ def normal(sigma_ms: float) -> Lateness:
     return lambda random, n: np.maximum(0, random.normal(5 * sigma_ms, sigma_ms, n)) * 1e6
 
 
+def waves(mean_ms: float) -> Lateness:
+    """Load comes and goes in seconds: late stamps follow late ones."""
+
+    def draw(random: np.random.Generator, n: int) -> Floats:
+        load = np.zeros(n)
+        for i, push in enumerate(random.normal(size=n - 1)):
+            load[i + 1] = 0.98 * load[i] + 0.2 * push
+        return random.uniform(0, mean_ms * 1e6, n) * np.exp(load)
+
+    return draw
+
+
 def bus(step_ms: float) -> Lateness:
     """Stamped at the end of a transfer of so many milliseconds on a bus with its own clock."""
 
@@ -123,6 +136,8 @@ DRIVERS = {
     "5 ms uniform, outliers": Driver(with_outliers(5)),
     "5 ms uniform, 20 % lost": Driver(uniform(5), lost=0.2),
     "1 ms uniform": Driver(uniform(1)),
+    "0.05 ms uniform": Driver(uniform(0.05)),
+    "load in waves, 0.5 ms": Driver(waves(0.5)),
     "0.3 ms exponential": Driver(exponential(0.3)),
     "8 ms bus transfers": Driver(bus(8), rate_ppm=0),
     "1 ms normal": Driver(normal(1)),
@@ -162,11 +177,23 @@ def follow(record: Record, info: SourceInfo, sequence: Times | None = None) -> T
     )
 
 
-def row(driver: Driver, seeds: int, seconds: float) -> str:
-    """Return one line of the table."""
+NORMAL = DRIVERS["1 ms normal"].lateness_ns
+AGES = {
+    "0.3 to 1 s": slice(8, 30),
+    "1 to 2 s": slice(30, 60),
+    "2 to 5 s": slice(60, 150),
+    "5 to 15 s": slice(150, 450),
+    "15 to 30 s": slice(450, 900),
+}
+"""Images since the first."""
+
+
+def rows(driver: Driver, seeds: int, seconds: float) -> tuple[str, str]:
+    """Return a line of either table: after the first minute, and by age before."""
     info = grabber(frame_period_s=driver.period_s)
     frames, minute = (round(t / driver.period_s) for t in (seconds, 60))
     spread, delay, inside, inside_all, refitted, cost = [], [], [], [], [], []
+    young: list[list[tuple[float, ...]]] = []
     counted = 0
     for seed in range(seeds):
         record = simulate(driver, frames, seed)
@@ -179,6 +206,8 @@ def row(driver: Driver, seeds: int, seconds: float) -> str:
         good = np.abs(about_ns) <= 2 * ticks.sigma_ns
         inside.append(float(good[late].mean()))
         inside_all.append(float(good.mean()))
+        z = about_ns / ticks.sigma_ns
+        young.append([(np.mean(about_ns[a] ** 2), np.mean(z[a] ** 2)) for a in AGES.values()])
         two_sided = refit(record.stamps_ns, record.frames, driver.period_s) - record.true_ns
         refitted.append(float(two_sided.std()))
         cost.append(ticks.tick_us)
@@ -186,15 +215,14 @@ def row(driver: Driver, seeds: int, seconds: float) -> str:
             ticks.clock.figures.missed == record.lost
         )
     rms = math.sqrt(float(np.mean(np.square(spread))))
-    return (
+    settled = (
         f"{rms / 1e3:7.1f} {max(spread) / 1e3:7.1f} {np.mean(delay) / 1e3:8.0f} "
         f"{100 * np.mean(inside):6.1f} {100 * np.mean(inside_all):6.1f} {counted:5d}/{seeds:<3d} "
         f"{math.sqrt(float(np.mean(np.square(refitted)))) / 1e3:7.1f} "
         f"{max(refitted) / 1e3:7.1f} {np.median(cost):6.1f}"
     )
-
-
-NORMAL = DRIVERS["1 ms normal"].lateness_ns
+    by_age = np.sqrt(np.mean(young, axis=0))
+    return settled, " ".join(f"{error / 1e3:8.1f} {z:5.2f}" for error, z in by_age)
 
 
 def main() -> None:
@@ -211,8 +239,14 @@ def main() -> None:
         f"{'stamps late by':26s} constant  worst    delay   % late  % all counted     rms   worst"
         "  us/tick"
     )
+    ages = []
     for name, driver in DRIVERS.items():
-        print(f"{name:26s} {row(driver, chosen.seeds, chosen.seconds)}", flush=True)
+        settled, by_age = rows(driver, chosen.seeds, chosen.seconds)
+        print(f"{name:26s} {settled}", flush=True)
+        ages.append(f"{name:26s} {by_age}")
+    print("\nby age: rms of the error in us, and of error over sigma")
+    print(f"{'':26s} " + " ".join(f"{age:>14s}" for age in AGES))
+    print("\n".join(ages))
 
 
 if __name__ == "__main__":
