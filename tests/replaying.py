@@ -7,8 +7,11 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from vdms_rt import codec
 from vdms_rt.logfile.writer import PART_SUFFIX, LogAttachment, LogMessage, LogWriter
-from vdms_rt.wire import topics
+from vdms_rt.wire import convert, picture_pb2, topics
 from vdms_rt.wire import vdms_pb2 as pb
 
 PERIOD_NS = 16_683_350
@@ -18,6 +21,7 @@ START_UTC_NS = 1_790_000_000_123_456_789
 SESSION = 0x00C0FFEE12345678
 AMPLITUDE_MM = 10.0
 FREQUENCY_HZ = 1.0
+PNG = codec.png(np.arange(48, dtype=np.uint8).reshape(6, 8))
 
 
 def t_ns_of(seq: int) -> int:
@@ -97,7 +101,7 @@ def write_recording(
 
     begin_ns = t_ns_of(seqs[0]) + utc_offset_ns
     log.add_metadata("vdms", {"station": station, "version": "9.9"})
-    log.attach(LogAttachment("reference.png", "image/png", begin_ns, b"picture"), begin_ns)
+    log.attach(LogAttachment("reference.png", "image/png", begin_ns, PNG), begin_ns)
     add(
         topics.RUN,
         begin_ns,
@@ -110,6 +114,11 @@ def write_recording(
             effective_config=json.dumps({"marker": [{"name": name} for name in markers]}),
             facts=[pb.Fact(name="source", value="written by a test")],
         ),
+    )
+    add(
+        topics.PICTURE,
+        begin_ns,
+        picture_pb2.CompressedImage.FromString(convert.picture_bytes(PNG, begin_ns, station)),
     )
     for seq in seqs:
         at_ns = t_ns_of(seq) + utc_offset_ns
