@@ -19,7 +19,9 @@ LEAST_OVERLAP = 0.5
 """Of the shorter of the two series."""
 LEAST_MOTION = 0.1
 """Of the variance of a whole series that its part in the overlap must have."""
-CANDIDATES = 24
+CANDIDATES = 32
+MOST_RESIDUAL = 1.0
+"""Beyond which most of what the camera saw is not in the reference."""
 SAME = 1.5
 """Places whose residuals differ by less than this factor fit equally well."""
 LIKELY = 3.0
@@ -131,14 +133,18 @@ def align(camera: Camera, series: Series, wanted: Wanted) -> Alignment:
     found = [
         one for place in places if (one := _refined(camera, series, place, wanted)) is not None
     ]
-    if not found:
+    least = min((one.residual for one in found), default=math.inf)
+    if least > MOST_RESIDUAL:
         raise AlignError(_nowhere(camera, series, wanted))
-    least = min(one.residual for one in found)
+    upright = [one for one in found if not one.mirrored] or found
+    least_upright = min(one.residual for one in upright)
     best = max(
-        (one for one in found if one.residual <= SAME * least),
+        (one for one in upright if one.residual <= SAME * least_upright),
         key=lambda one: (one.overlap, -one.residual),
     )
-    best = _with_others(best, found)
+    best = _with_others(best, upright)
+    if 2 * least < best.residual:
+        best = replace(best, mirrored=True)
     return _with_hints(best, camera, series, wanted)
 
 
@@ -174,9 +180,7 @@ def _places(time_s: Floats, seen_mm: Floats, series: Series, wanted: Wanted) -> 
     quality[count < LEAST_OVERLAP * min(covered.sum(), has.sum())] = 0
     if wanted.offset_s is not None:
         quality[np.abs(offsets_s - wanted.offset_s) > wanted.within_s] = 0
-    height = np.abs(quality) if wanted.sign or wanted.axis else quality
-    if not height.max(initial=0) > 0:
-        height = np.abs(quality)
+    height = np.abs(quality)
     tops = np.unique(np.append(signal.find_peaks(height)[0], int(np.argmax(height))))
     tops = tops[height[tops] > 0]
     if not len(tops):

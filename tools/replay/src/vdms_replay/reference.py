@@ -137,7 +137,7 @@ def _choose(path: Path, columns: list[Column], asked: str | None) -> Column:
 
 
 def _is_time(column: Column) -> bool:
-    name = _bare_name(column.name).lower()
+    name = _bare_name(column.name).rpartition(".")[2].lower()
     return name in _TIME_NAMES or (
         _unit_of(column) in SECONDS_PER_UNIT and name.startswith(("time", "t_"))
     )
@@ -252,7 +252,7 @@ def _layout(head: list[str]) -> tuple[bool, str, int | None]:
     for number, line in enumerate(head):
         for separator in ("\t", ";", ",", ""):
             cells = _cells(line, separator)
-            if separator and len(cells) < 2:
+            if not cells or (separator and len(cells) < 2):
                 continue
             if all(_is_number(cell) for cell in cells):
                 return False, separator, number
@@ -297,6 +297,7 @@ def _mat(path: Path) -> list[Column]:
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
+    path.stat()
     try:
         named = _flat(loadmat(path, squeeze_me=True, struct_as_record=True))
     except NotImplementedError:
