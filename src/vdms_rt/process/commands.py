@@ -22,7 +22,7 @@ from vdms_rt.command import (
 )
 from vdms_rt.measure.fieldorder import OrderEvidence
 from vdms_rt.measure.regions import check_regions
-from vdms_rt.model import Displacement, Picture, Scan
+from vdms_rt.model import Displacement, Picture, Region, Scan
 from vdms_rt.process.progress import Phase, Progress, lost_long
 from vdms_rt.process.zero import moved_zero
 from vdms_rt.setup import MarkerSetUp, SetUp
@@ -71,9 +71,9 @@ def changed(
         case Find():
             return _finding(progress)
         case UseRegions():
-            return _with_regions(progress, command)
+            return _with_regions(progress, command, recent)
         case TakeReference():
-            return _referencing(progress, command)
+            return _referencing(progress, command, recent)
         case SetZero():
             return _with_zero(progress, command, recent)
         case UseAxis():
@@ -103,7 +103,7 @@ def _finding(progress: Progress) -> tuple[Progress, str]:
     return _anew(progress, plan=plan, phase=Phase.SEARCHING, regions=()), text
 
 
-def _with_regions(progress: Progress, command: UseRegions) -> tuple[Progress, str]:
+def _with_regions(progress: Progress, command: UseRegions, recent: Recent) -> tuple[Progress, str]:
     n = _index(progress, command.marker)
     circles = len(progress.plan.shapes[n].circles_mm)
     if len(command.regions) != circles:
@@ -117,7 +117,7 @@ def _with_regions(progress: Progress, command: UseRegions) -> tuple[Progress, st
             "searching",
             "the other markers are still being looked for; wait until all are found, then set one",
         )
-    regions = list(progress.regions or progress.plan.regions)
+    regions = list(_regions_now(progress, recent) or progress.plan.regions)
     regions[n] = command.regions
     everything = [r for one in regions for r in one]
     if faults := check_regions(everything, progress.width_px, progress.height_px):
@@ -129,7 +129,9 @@ def _with_regions(progress: Progress, command: UseRegions) -> tuple[Progress, st
     return _anew(progress, plan=plan, phase=Phase.STILLS, regions=tuple(regions)), text
 
 
-def _referencing(progress: Progress, command: TakeReference) -> tuple[Progress, str]:
+def _referencing(
+    progress: Progress, command: TakeReference, recent: Recent
+) -> tuple[Progress, str]:
     if not progress.regions:
         raise Refused("searching", "no marker is found yet; aim the camera at it, or set regions")
     lost = [
@@ -143,7 +145,41 @@ def _referencing(progress: Progress, command: TakeReference) -> tuple[Progress, 
     if command.stills is not None:
         plan = dataclasses.replace(plan, reference_pictures=command.stills)
     text = f"taking the reference from {plan.reference_pictures} stills as soon as the marker rests"
-    return _anew(progress, plan=plan, phase=Phase.STILLS), text
+    regions = _regions_now(progress, recent)
+    return _anew(progress, plan=plan, phase=Phase.STILLS, regions=regions), text
+
+
+def _regions_now(progress: Progress, recent: Recent) -> tuple[tuple[Region, ...], ...]:
+    """Return the regions in which stills can be taken: those of the set-up, moved with their
+    circles. The ones that follow the circles have these in their middle, and may reach beyond the
+    sheet."""
+    set_up = progress.set_up
+    if set_up is None or not progress.watches:
+        return progress.regions
+    return tuple(
+        marker.regions
+        if plan_regions
+        else _moved(marker, recent.get(marker.shape.name, ()), progress)
+        for marker, plan_regions in zip(set_up.markers, progress.plan.regions, strict=True)
+    )
+
+
+def _moved(
+    marker: MarkerSetUp, newest: Sequence[Displacement], progress: Progress
+) -> tuple[Region, ...]:
+    seen = [d.circles for d in newest if d.valid and d.setup_revision == progress.revision]
+    if not seen:
+        return marker.regions
+    return tuple(
+        dataclasses.replace(
+            region,
+            x_px=min(max(round(region.x_px + c.x_px - x), 0), progress.width_px - region.width_px),
+            y_px=min(
+                max(round(region.y_px + c.y_px - y), 0), progress.height_px - region.height_px
+            ),
+        )
+        for region, c, (x, y) in zip(marker.regions, seen[-1], marker.reference_px, strict=True)
+    )
 
 
 def _with_zero(progress: Progress, command: SetZero, recent: Recent) -> tuple[Progress, str]:
