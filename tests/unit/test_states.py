@@ -65,6 +65,8 @@ def test_from_no_device_to_streaming(bench):
         bench.refuse("plug one in", gone=True)
         bench.now_s += states.RETRY_S
     assert bench.state is State.NO_DEVICE
+    bench.refuse("no permission yet", gone=False)
+    bench.refuse("no permission", gone=False)
     bench.refuse("no permission", gone=False)
     assert bench.open()
     assert bench.state is State.STARTING

@@ -129,12 +129,13 @@ def choose_device(
     analogue grabber, else another known grabber, else the first usable device that is not the
     computer's own camera, else that.
     With `before`, the device that was in use, it means that one alone: the reference is of its
-    pictures. Raises DeviceGone when none fits that may still come, SourceError when none is usable
-    or more than one fits.
+    pictures. So does a path that has gone, for the kernel may give another number.
+    Raises DeviceGone when none fits that may still come, SourceError when none is usable or more
+    than one fits.
     """
     devices = list_devices(sysfs) if devices is None else devices
     if text.startswith("/"):
-        return _at_path(text, devices)
+        return _at_path(text, devices, before)
     if text == "auto" and before is not None:
         return _come_back(before, devices)
     if not devices:
@@ -190,10 +191,12 @@ def why_unusable(device: DeviceInfo) -> str:
     return f"has only {', '.join(device.formats) or 'no format'}"
 
 
-def _at_path(path: str, devices: Sequence[DeviceInfo]) -> DeviceInfo:
+def _at_path(path: str, devices: Sequence[DeviceInfo], before: DeviceInfo | None) -> DeviceInfo:
     # A link, as udev makes them, leads to another node after the device was plugged in anew.
     node = os.path.realpath(path)
     device = next((d for d in devices if d.node == node), DeviceInfo(node))
+    if before is not None and device not in devices:
+        return _come_back(before, devices)
     if device.slow:
         raise SourceError(f"{device.title} {why_unusable(device)}")
     return replace(device, node=path) if path != node else device

@@ -78,6 +78,7 @@ class DeviceStates:
         """When the newest frame came, since it was opened."""
         self._worked_s: float | None = None
         """When the newest frame with a signal came, ever."""
+        self._refused = ""
         self._had = False
         """There was a device."""
         self._nothing_s: float | None = None
@@ -104,7 +105,9 @@ class DeviceStates:
 
     def not_opened(self, now_s: float, why: str, *, gone: bool) -> Change | None:
         """It could not be opened; `gone` says that it is not there at all."""
-        if self.state is State.STALLED and not gone:
+        before, self._refused = self._refused, "" if gone else why
+        if not gone and (self.state is State.STALLED or why != before):
+            # For a moment after it was plugged in, udev has not given its permissions yet.
             return None
         if gone and self._reset_s is not None and now_s - self._reset_s < RETURN_S:
             return None
