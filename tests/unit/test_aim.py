@@ -179,6 +179,12 @@ def test_a_marker_near_a_border_is_a_reason_to_turn_the_camera() -> None:
     )
 
 
+def test_what_lies_beyond_the_sheet_of_a_small_marker_is_no_noise() -> None:
+    told = seen(picture([View(px_per_mm=0.26)], PLAIN))
+    assert told.disc_px < 15
+    assert told.noise_grey == pytest.approx(2, rel=0.3)
+
+
 def test_small_circles_and_an_unlikely_pixel_aspect_are_told() -> None:
     small = seen(
         picture([View(px_per_mm=0.2, margin=1.0)], dataclasses.replace(PLAIN, blur_px=(0.4, 0.4)))

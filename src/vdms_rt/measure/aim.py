@@ -8,7 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vdms_rt.measure.expect import EDGE_PX, Appearance, first_look, spread_px2
+from vdms_rt.measure.expect import (
+    EDGE_PX,
+    MARGIN_PX,
+    Appearance,
+    first_look,
+    spread_px2,
+)
 from vdms_rt.measure.gate import Shape, Workspace, distance_px
 from vdms_rt.measure.homography import (
     Matrix,
@@ -99,8 +105,15 @@ def first_study(
     begin = first_slow(len(centres_px))
     seen, _ = measure(image, row_offset, row_step, expected, begin, work)
     # The slope of light that lies on the discs at rest is theirs: with it expected, it is not
-    # divided out here, as it will not be later.
-    expected = expected._replace(light_per_px=tuple(r.light_per_px for r in seen))
+    # divided out here, as it will not be later. Around small circles a narrower gate keeps what
+    # lies beyond the sheet out.
+    smallest_px = min(min(semi) for semi in semi_axes_px)
+    expected = expected._replace(
+        x_px=tuple(r.x_px for r in seen),
+        y_px=tuple(r.y_px for r in seen),
+        margin_px=min(max(math.ceil(smallest_px / 2), math.ceil(MARGIN_PX)), expected.margin_px),
+        light_per_px=tuple(r.light_per_px for r in seen),
+    )
     return study(image, row_offset, row_step, expected, begin, work)
 
 
