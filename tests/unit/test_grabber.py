@@ -1,11 +1,13 @@
 """Which device a person means."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from vdms_rt.capture.grabber import (
+    GRABBERS,
     NO_DEVICE,
     DeviceInfo,
     better_device,
@@ -259,3 +261,11 @@ def test_a_known_grabber_without_a_driver_is_named(tmp_path):
     (usb / "1-4:1.0" / "video4linux" / "video0").mkdir(parents=True)
     with pytest.raises(SourceError, match="no video device on this computer"):
         choose_device("auto", sysfs=tmp_path)
+
+
+def test_the_udev_rules_know_the_same_grabbers():
+    rules = (Path(__file__).parents[2] / "systemd" / "70-vdms-rt.rules").read_text()
+    named = re.findall(r'ATTRS\{idVendor\}=="(\w+)", ATTRS\{idProduct\}=="([\w|]+)"', rules)
+    assert {f"{vendor}:{one}" for vendor, products in named for one in products.split("|")} == set(
+        GRABBERS
+    )

@@ -29,7 +29,7 @@ ASK_S = 0.5
 """From one question to the driver, whether there is a signal, to the next. A question is one or two
 transfers on the decoder's own slow bus, some milliseconds."""
 LOOK_S = 0.2
-"""From one look at a picture, whether it shows anything, to the next: a look costs 0.1 ms."""
+"""From one look at a picture, whether it shows anything, to the next: a look costs 0.2 ms."""
 NO_SIGNAL_S = 0.6
 """Pictures of nothing for so long: three looks. A lamp that is switched may spoil one."""
 SIGNAL_S = 0.6
