@@ -83,6 +83,19 @@ def test_sleep_is_no_step() -> None:
     assert utc.sample() == (False, [])
 
 
+def test_a_pause_between_two_readings_is_no_sleep() -> None:
+    clocks = Clocks()
+    pauses_ns = iter([0] * 5 + [20_000_000] * 4)
+
+    def read_boot() -> int:
+        clocks.monotonic_ns += next(pauses_ns, 0)
+        return clocks.read_boot()
+
+    utc = UtcOffset(clocks.read_monotonic, clocks.read_utc, read_boot, lambda: clocks.state)
+    assert utc.sample() == (False, [])
+    assert utc.sample() == (False, [])
+
+
 def test_this_computers_clocks() -> None:
     state, error_us = utc_state()
     assert state in ("synchronised", "not synchronised", "unknown")

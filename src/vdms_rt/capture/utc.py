@@ -101,7 +101,10 @@ class UtcOffset:
         return slept, []
 
     def _tightest(self) -> tuple[int, int, int, int]:
-        best = (0, 0, 0, 0)
+        """Return the offset, its error, when it was read, and how long the computer has slept."""
+        best = (0, 0, 0)
+        # The two clocks are read one after the other: a pause in between makes the sleep longer.
+        asleep_ns = 2**63
         for attempt in range(TRIES):
             before_ns = self._monotonic()
             utc_ns = self._utc()
@@ -110,8 +113,9 @@ class UtcOffset:
             error_ns = (after_ns - before_ns + 1) // 2
             if attempt == 0 or error_ns < best[1]:
                 middle_ns = before_ns + error_ns
-                best = (utc_ns - middle_ns, error_ns, after_ns, boot_ns - after_ns)
-        return best
+                best = (utc_ns - middle_ns, error_ns, after_ns)
+            asleep_ns = min(asleep_ns, boot_ns - after_ns)
+        return *best, asleep_ns
 
     @staticmethod
     def _stepped(step_ns: int, now_ns: int, offset_ns: int) -> list[Event]:
