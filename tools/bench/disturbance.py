@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from tools.bench.film import Film, Picture, Way
+from tools.bench.film import Film, Picture, Way, film_of
 from tools.bench.picture import DISTURBANCES, Bench, Grey, disturbed
 from tools.bench.stage import PERIOD_NS, Stage, field_offsets_s, flagged
 from vdms_rt.model import Displacement
@@ -70,15 +70,13 @@ class Swing:
         while not self.stage.measuring:
             if self.n > 100:
                 raise SystemExit(f"no reference from {self.n} frames of the marker at rest")
-            self.show(self.stage, self.clean(self.places_mm(0.0)))
+            self.show(self.stage, self.clean([0.0] * len(field_offsets_s(sampling))))
         self.begin = self.n
 
-    def places_mm(self, amplitude_mm: float = AMPLITUDE_MM) -> list[float]:
+    def places_mm(self) -> list[float]:
         """Return where the marker is in each picture of the next frame, the first one first."""
-        if not amplitude_mm:
-            return [0.0] * len(field_offsets_s(self.sampling))
         t_s = (self.n - self.begin) * PERIOD_NS / 1e9 + np.array(field_offsets_s(self.sampling))
-        return (amplitude_mm * np.sin(2 * np.pi * t_s)).tolist()
+        return (AMPLITUDE_MM * np.sin(2 * np.pi * t_s)).tolist()
 
     def clean(self, places_mm: list[float]) -> Picture:
         # A film's frame begins with the top field, which is the later one.
@@ -120,7 +118,7 @@ class Swing:
 def trials(kind: str, sampling: str, count: int, seed: int) -> Row:
     """Hit a disc `count` times, each disc in turn."""
     rng = np.random.default_rng([seed, KINDS.index(kind), len(sampling)])
-    film = Film(BENCH, Way(AMPLITUDE_MM))
+    film = film_of(BENCH, Way(AMPLITUDE_MM))
     errors: list[NDArray[np.float64]] = []
     samples = lost = told = all_used = silent = 0
     for trial in range(count):

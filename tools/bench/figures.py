@@ -43,6 +43,7 @@ STYLE = {
 }
 OTSU, SMOOTH, BOUND = "#c44e52", "#1f5fa8", "0.35"
 WIDTH_IN = 7.1
+BENCH = Bench(distance_m=8.0, angle_deg=30.0)
 SHOWN_S = 2.0
 MARKS = "osD^v"
 
@@ -64,7 +65,6 @@ def _save(figure: Figure, path: Path) -> None:
 def time_histories(seed: int = 1) -> Figure:
     """Return figure 3.3: displacement measured and true over time, and the error below it, for 10,
     1 and 0.1 mm at 8 m and 30 deg."""
-    bench = Bench(distance_m=8.0, angle_deg=30.0)
     with mpl.rc_context(STYLE):
         figure = Figure((WIDTH_IN, 3.6), layout="constrained")
         axes = figure.subplots(2, 3, sharex=True, height_ratios=(3, 2))
@@ -73,7 +73,7 @@ def time_histories(seed: int = 1) -> Figure:
         for column, amplitude in enumerate((10.0, 1.0, 0.1)):
             setting = Setting(
                 "figure 3.3",
-                bench,
+                BENCH,
                 amplitude_mm=amplitude,
                 methods=("otsu", "smooth"),
                 samples=int(SHOWN_S * 30),

@@ -116,7 +116,8 @@ def record(setting: Setting) -> dict[tuple[float, str], Series]:
         1 if not exposure_s else 4 + ceil(3 * setting.velocity_mm_s * exposure_s * film.px_per_mm)
     )
     within_s, shares = exposure_nodes(exposure_s, nodes)
-    begin = REST_FRAMES + ceil(RISE_S / PERIOD_S)
+    # The first exposure that lies in the steady swing as a whole.
+    begin = REST_FRAMES + ceil(RISE_S / PERIOD_S) + 1
     end = begin + ceil(setting.samples / len(offsets_s))
     for n in range(end):
         late_ns = round(rng.normal(0, 1000 * setting.sigma_t_us)) if setting.sigma_t_us else 0
