@@ -152,9 +152,7 @@ class Daemon:
             runs=self._outlet.recorder,
             directory=Path(self.config.record.directory).expanduser(),
         )
-        return ControlServer(
-            self.config.control, self.config.station.name, publisher.session, desk
-        )
+        return ControlServer(self.config.control, self.config.station.name, publisher.session, desk)
 
     def _start(self) -> dict[str, threading.Thread]:
         bodies: dict[str, Callable[[], None]] = {
@@ -247,7 +245,7 @@ class Daemon:
 
     def _account(self) -> int:
         """Tell what there is to tell at the end and return the exit status."""
-        self._outlet.tell()
+        self._outlet.tell(at_end=True)
         for fault in self._faults:
             if isinstance(fault, VdmsError):
                 raise fault

@@ -6,9 +6,9 @@ import logging
 import math
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from vdms_rt import codec
 from vdms_rt.model import Displacement, Event, Frame, Health, Luma, Picture, Region, Severity, Truth
@@ -28,10 +28,24 @@ LEVELS = {
     Severity.ERROR: logging.ERROR,
 }
 
-
 TOLD_OF_A_CODE = 3
+TELL_S = 10.0
+"""In so long, of the events of one code the first few are told one by one, the rest in one line: a
+bad cable may lose frames many times a second, which the recording has one by one."""
 RECENT = 3600
 """Samples of each marker that are kept for questions about the last minute."""
+
+
+@dataclass(slots=True)
+class _Telling:
+    """What was said to the console of one code lately."""
+
+    since_s: float
+    told: int = 0
+    held: int = 0
+    """Events not told yet."""
+    newest: Event | None = None
+    """Of those."""
 
 
 class Outlet:
@@ -54,6 +68,7 @@ class Outlet:
         self._utc_offset_ns = time.time_ns() - time.monotonic_ns()
         self._newest_ns = 0
         self._untold: deque[Event] = deque(maxlen=1000)
+        self._tellings: dict[str, _Telling] = {}
         self._lock = threading.Lock()
         self._age_sum_ms = 0.0
         self._age_count = 0
@@ -106,20 +121,38 @@ class Outlet:
             convert.event_bytes(event, self.session),
         )
 
-    def tell(self) -> None:
+    def tell(self, *, at_end: bool = False) -> None:
         """Write what happened since the last call to the console, which may make its writer wait;
-        so no stage does it, but the supervisor. Of many events of one code, the first few."""
-        counts: Counter[str] = Counter()
+        so no stage does it, but the supervisor. Every change of state; of many other events of
+        one code the first few, and after TELL_S, or `at_end`, how many more, with the newest."""
+        now_s = time.monotonic()
         while self._untold:
             event = self._untold.popleft()
-            counts[event.code] += 1
-            if counts[event.code] <= TOLD_OF_A_CODE:
+            telling = self._tellings.setdefault(event.code, _Telling(now_s))
+            if telling.told < TOLD_OF_A_CODE or event.code == "state":
+                telling.told += 1
                 log.log(LEVELS[event.severity], event.text)
+            else:
+                telling.held += 1
+                telling.newest = event
             if event.code == "reference" and self.newest_set_up is not None:
                 self._tell_set_up(self.newest_set_up)
-        for code, count in counts.items():
-            if count > TOLD_OF_A_CODE:
-                log.warning("%d more events: %s", count - TOLD_OF_A_CODE, code)
+        for code, telling in list(self._tellings.items()):
+            if at_end or now_s - telling.since_s >= TELL_S:
+                del self._tellings[code]
+                self._tell_held(code, telling, now_s - telling.since_s)
+
+    def _tell_held(self, code: str, telling: _Telling, lasted_s: float) -> None:
+        newest = telling.newest
+        if newest is not None:
+            log.log(
+                LEVELS[newest.severity],
+                "%s (the last of %d more such events, %s, in %.0f s)",
+                newest.text,
+                telling.held,
+                code,
+                lasted_s,
+            )
 
     def _tell_set_up(self, set_up: SetUp) -> None:
         advised = any(m.aim is not None and m.aim.advice for m in set_up.markers)

@@ -78,7 +78,7 @@ class Recorder:
         self._run_header = run_header
         self._run_end = run_end
         self._report = report
-        self._directory = Path(config.directory).expanduser()
+        self._directory = Path(config.directory).expanduser().absolute()
         self._run = ""
         self._name = self._file_name()
         self._cut = ""
