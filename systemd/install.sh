@@ -106,6 +106,9 @@ install_service() {
     install -D -m 644 systemd/vdms-rt.sysusers "$local/sysusers.d/vdms-rt.conf"
     systemd-sysusers "$local/sysusers.d/vdms-rt.conf"
     install -D -m 644 systemd/vdms-rt.service "$local/systemd/system/vdms-rt.service"
+    # A station more for each /etc/vdms-rt/NAME.toml: vdms-rt@NAME, with a set-up of its own.
+    sed 's|/vdms-rt\.toml|/%i.toml|; s|^StateDirectory=.*|&/%i|' systemd/vdms-rt.service \
+        >"$local/systemd/system/vdms-rt@.service"
     install -D -m 644 systemd/70-vdms-rt.rules "$local/udev/rules.d/70-vdms-rt.rules"
     mkdir -p /usr/local/bin
     ln -sfn "$home/current/bin/vdms-rt" /usr/local/bin/vdms-rt
@@ -123,11 +126,12 @@ install_service() {
 }
 
 start_service() {
+    systemctl try-restart 'vdms-rt@*'
     if [ -e /dev/vdms-grabber ] || systemctl --quiet is-active vdms-rt; then
         if systemctl restart vdms-rt; then
             say "the service runs; look at it with: vdms-rt watch"
         else
-            say "the service did not start; see why with: journalctl -u vdms-rt -n 20" >&2
+            say "the service did not start; see why with: sudo journalctl -u vdms-rt -n 20" >&2
             exit 1
         fi
     else

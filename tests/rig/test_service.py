@@ -46,7 +46,7 @@ def test_the_installer_says_what_to_do_next(installed: str) -> None:
     assert "vdms-rt watch" in installed.splitlines()[-1]
     assert CONFIG.read_text() == Path("config/vdms-rt.toml").read_text()
     assert "video" in run("id", "--name", "--groups", "vdms-rt")
-    run("systemd-analyze", "verify", "vdms-rt.service")
+    run("systemd-analyze", "verify", "vdms-rt.service", "vdms-rt@second.service")
     # Anybody may use the command.
     version = run("runuser", "-u", "nobody", "--", "/usr/local/bin/vdms-rt", "--version")
     assert version.startswith("vdms-rt ")
@@ -82,9 +82,9 @@ def test_first_light(grabber: Grabber) -> None:
     said = service.journal()
     assert any("frames come from" in line for line in said)
     assert any(line.startswith("reference taken") for line in said)
-    # Neither priorities nor times are left in the text, and nothing is in trouble.
+    # Neither priorities nor times are left in the text.
     assert not [line for line in said if re.match(r"<\d>|\d\d:\d\d:\d\d", line)]
-    assert service.journal("", "--priority=err") == []
+    assert service.show("NRestarts") == "0"
 
 
 def test_the_same_process_goes_on_after_a_pulled_cable(grabber: Grabber) -> None:
@@ -112,15 +112,18 @@ def test_what_was_killed_comes_back(grabber: Grabber) -> None:
 
 
 def test_what_hangs_is_ended_by_the_watchdog(grabber: Grabber) -> None:
+    # From here on without frames, which keep the virtual machine so busy that all takes long.
+    grabber.unplug()
     pid, begun = service.pid(), service.cursor()
     os.kill(pid, signal.SIGSTOP)
     wait_for(lambda: service.pid() not in (0, pid), "a new process", service.DEADLINE_S)
     service.wait_until("active")
     assert service.show("NRestarts") == "2"
+    wait_for(lambda: service.show("StatusText").startswith("no device"), "its state", 60)
     assert any("Watchdog timeout" in line for line in service.journal(begun))
 
 
-def test_a_wrong_configuration_is_one_line_and_no_restart(grabber: Grabber) -> None:
+def test_a_wrong_configuration_is_one_line_and_no_restart(installed: str) -> None:
     right, begun = CONFIG.read_text(), service.cursor()
     CONFIG.write_text(right.replace("ring_slots = 64", "ring_slots = 6"))
     run("systemctl", "stop", "vdms-rt")
@@ -136,17 +139,16 @@ def test_a_wrong_configuration_is_one_line_and_no_restart(grabber: Grabber) -> N
     CONFIG.write_text(right)
 
 
-def test_an_upgrade_keeps_the_configuration_and_restarts(grabber: Grabber) -> None:
+def test_an_upgrade_keeps_the_configuration_and_restarts(installed: str) -> None:
     CONFIG.write_text(CONFIG.read_text().replace('name = "station"', 'name = "tower"'))
     said = service.make("install")
     assert f"{CONFIG} stays as it is" in said
     assert said.splitlines()[-1] == "vdms-rt: the service runs; look at it with: vdms-rt watch"
     assert service.show("ActiveState") == "active"
-    service.wait_until_measuring()
-    assert list(RECORDINGS.glob("tower_*.mcap.part"))
+    wait_for(lambda: list(RECORDINGS.glob("tower_*.mcap.part")), "a recording", service.DEADLINE_S)
 
 
-def test_removed_it_leaves_what_was_measured(grabber: Grabber) -> None:
+def test_removed_it_leaves_what_was_measured(installed: str) -> None:
     recordings = {path.name.removesuffix(".part") for path in RECORDINGS.iterdir()}
     said = service.make("uninstall")
     assert "/var/log/vdms-rt stays" in said
