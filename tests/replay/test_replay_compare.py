@@ -72,6 +72,7 @@ def test_fields_beside_a_vibrometer(fields: Case, capsys: pytest.CaptureFixture[
     assert (found["distance_m"], found["angle_deg"]) == (8.0, 30.0)
 
 
+@pytest.mark.slow
 def test_a_woven_frame_is_compared_with_the_mean_over_both_fields(
     woven: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:

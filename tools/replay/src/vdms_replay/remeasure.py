@@ -49,6 +49,8 @@ class Change(NamedTuple):
     """The sampling or the times are others, so what the log knew before a picture does not fit."""
     order: Scan | None = None
     """Of the fields, where the recording's end knows it."""
+    was: str = "auto"
+    """The sampling with which it was recorded."""
 
     @property
     def nothing(self) -> bool:
@@ -162,14 +164,14 @@ class Walk:
     def _measured(self, pixels: pb.Pixels) -> Iterator[Said]:
         frame = self._frame(pixels)
         split = self._split(frame)
-        if self._stand(split[0].seq):
+        if self._stand(split[0], frame.scan):
             # What is known now may put the fields in another order.
             split = self._split(frame)
         if self.progress is None:
             self.unknown += 1
             return
         for picture in split:
-            self._stand(picture.seq)
+            self._stand(picture, frame.scan)
             before = self._prepared(self.progress, picture, pixels)
             after, samples, events = step(before, picture, self._work)
             self.progress = after
@@ -213,11 +215,17 @@ class Walk:
         order = None if self.progress is None else self.progress.order
         return pictures(frame, self._sampling, order)
 
-    def _stand(self, seq: int) -> bool:
-        """Go to where the log says that measuring stood before a picture; False if it says
-        nothing."""
+    def _stand(self, picture: Picture, scan: Scan) -> bool:
+        """Go to where the log says that measuring stood before a picture of a frame; False if it
+        says nothing."""
+        number, pictures_of_a_frame = picture.seq, 1
+        if not self._change.nothing:
+            # Its pictures may be numbered otherwise than those that were recorded.
+            number = picture.frame_seq
+            whole = scan is Scan.PROGRESSIVE or (scan.interlaced and self._change.was == "frame")
+            pictures_of_a_frame = 1 if whole else 2
         found = False
-        while self._waiting and self._waiting[0].seq <= seq:
+        while self._waiting and self._waiting[0].seq // pictures_of_a_frame <= number:
             said = self._waiting.popleft()
             self.progress = self.standing_at(said, self.progress)
             found = True

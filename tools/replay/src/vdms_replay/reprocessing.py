@@ -168,8 +168,8 @@ class Job:
             )
         if not self._has_checkpoints:
             raise ReplayError(
-                f"{self._source.paths[0]}: holds no checkpoints, as recordings of older versions "
-                'of vdms-rt; measure it again with source = "log" and `vdms-rt run`'
+                f"{self._source.paths[0]}: holds no checkpoint to begin from, of which there is "
+                "one a second; name the part before it too"
             )
         if pieces is not None:
             yield from pieces.end()
@@ -222,7 +222,8 @@ class Job:
             )
         settings = self._settings
         section = config.setdefault("process", {})
-        sampling = settings.sampling or section.get("sampling", "auto")
+        was = section.get("sampling", "auto")
+        sampling = settings.sampling or was
         section["sampling"] = sampling
         if settings.method is not None:
             section["method"] = settings.method
@@ -249,7 +250,7 @@ class Job:
             delay_ns = round(1e6 * config.get("camera", {}).get("chain_delay_ms", 0.0))
             times = refitted(known.stamps.rows, exposure_ns, delay_ns)
         anew = settings.sampling is not None or settings.refit_time
-        change = Change(settings.method, settings.lens, anew, known.order)
+        change = Change(settings.method, settings.lens, anew, known.order, was)
         terms = Terms(run.session, sampling, change, times)
         return Changed(terms) if settings.changed else AsItWas(terms)
 
