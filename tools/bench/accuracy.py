@@ -80,18 +80,20 @@ def _short(value: object) -> object:
 
 
 def table_of(results: Sequence[Result]) -> Table:
-    """Return one line for each setting, over all distances and angles: the worst, and the
-    median."""
+    """Return one line for each setting, over all distances and angles: the worst error beside its
+    bound, the median and the worst of the ratio. `loss` is what the exposure takes off the
+    amplitude."""
     table = Table(title="Eq. 3.1 in %, over all distances and angles; std of x over its bound")
     for name in ("set", "method", "sampling"):
         table.add_column(name)
-    names = ("f Hz", "A mm", "v mm/s", "exp ms", "noise", "cases", "worst %", "bound %")
+    names = ("f Hz", "A mm", "v mm/s", "exp ms", "loss %", "noise", "cases", "worst %", "bound %")
     for name in (*names, "median", "worst", "in 2 sigma", "flagged %", "lost %"):
         table.add_column(name, justify="right")
     groups: dict[tuple[object, ...], list[Result]] = {}
     for r in results:
         key = (r.set, r.method, r.sampling, r.frequency_hz, r.amplitude_mm)
-        groups.setdefault((*key, r.velocity_mm_s, r.exposure_ms, r.noise_grey), []).append(r)
+        light = (r.velocity_mm_s, r.exposure_ms, r.exposure_loss_percent, r.noise_grey)
+        groups.setdefault((*key, *light), []).append(r)
     for (name, method, sampling, *numbers), rows in groups.items():
         worst = max(
             rows, key=lambda r: r.over_bound if np.isnan(r.error_percent) else r.error_percent
