@@ -3,6 +3,8 @@
 # drivers, over this machine's root file system (read-only, a tmpfs above it).
 #
 #   vm.sh [-s] [-t SECONDS] [-o DIR] [--] COMMAND [ARG...]
+#   vm.sh -p
+#     -p           prepare this machine, and run nothing: packages and kernel
 #     -s           boot systemd, with udev and the journal; else nothing runs but the command
 #     -t SECONDS   limit for the whole run (600)
 #     -o DIR       host folder, writable in the guest as /mnt/out; console.log goes there too
@@ -21,8 +23,10 @@ accel=${VDMS_RIG_ACCEL:-tcg,thread=multi}
 limit_s=600
 out=
 init=command
+only_prepare=
 while [ $# -gt 0 ]; do
     case $1 in
+        -p) only_prepare=yes; shift ;;
         -s) init=systemd; shift ;;
         -t) limit_s=$2; shift 2 ;;
         -o) out=$2; shift 2 ;;
@@ -33,7 +37,7 @@ while [ $# -gt 0 ]; do
 done
 say() { echo "rig: $*" >&2; }
 die() { say "$*"; exit 1; }
-[ $# -gt 0 ] || die "no command was given to run in the virtual machine"
+[ $# -gt 0 ] || [ -n "$only_prepare" ] || die "no command was given to run in the virtual machine"
 
 # --- What it needs: packages, and the kernel ------------------------------------------------
 quietly() {
@@ -43,7 +47,8 @@ quietly() {
 
 prepare() {
     local missing=() package image
-    for package in qemu-system-x86 kmod cpio busybox-static v4l-utils usbip udev systemd-sysv; do
+    for package in qemu-system-x86 kmod cpio busybox-static v4l-utils usbip udev \
+        systemd-sysv make python3-venv; do
         dpkg-query -Wf '${db:Status-Status}' "$package" 2>/dev/null | grep -qx installed ||
             missing+=("$package")
     done
@@ -77,6 +82,7 @@ exec 9>"$cache/lock"
 flock 9
 prepare
 exec 9>&-
+[ -z "$only_prepare" ] || exit 0
 version=$(cat "$cache/version")
 
 # --- The initramfs: busybox, the modules that mount the root, and an init --------------------
