@@ -10,15 +10,18 @@ import numpy as np
 
 from vdms_rt.measure.edge import profile, weight
 from vdms_rt.measure.gate import Shape, outline
-from vdms_rt.measure.homography import Matrix, jacobian_px_per_mm, to_marker_mm
+from vdms_rt.measure.homography import Matrix, to_marker_mm
+from vdms_rt.measure.lens import Lens, distort_point, undistort_px
+from vdms_rt.measure.smear import SMEARED_WAY, smear
+
+Triple = tuple[float, float, float]
 
 MARGIN_PX = 4.0
 """The blurred edge takes two pixels on each side and rounding to whole pixels half a one."""
 EDGE_PX = 2.0
 MAX_MARGIN_PX = 24
-BLUR_MOMENT = 1 / 22
-"""Of the square of the way that a circle goes in an exposure: what the second moment gains. Light
-alone would gain 1/12; the weight is steeper, 1/24 on a short way and 1/20 on a long one."""
+LEAST_WAY = 0.25
+"""In edge widths: a shorter way in the exposure does nothing to an edge."""
 
 
 class Raster(NamedTuple):
@@ -75,6 +78,12 @@ class Expected(NamedTuple):
     """Covariance xx, xy, yy of the centres for noise as large as the contrast."""
     blur_px: tuple[tuple[float, float], ...]
     """The way that each circle goes in an exposure."""
+    shift_px: tuple[tuple[float, float], ...]
+    """What each centre lacks of the mean over the exposure, by the acceleration."""
+    doubt_px: float
+    """How far that may be off."""
+    smeared: bool
+    """The way is so long that the weights for smeared edges serve better."""
     travel_px: tuple[float, ...]
     """How far each circle is from its place at rest."""
     reach_px: tuple[tuple[float, float], ...]
@@ -87,97 +96,142 @@ class Forecast:
     Neither the picture nor earlier calls change it.
     """
 
-    def __init__(self, appearance: Appearance, h: Matrix, exposure_s: float) -> None:
+    def __init__(
+        self,
+        appearance: Appearance,
+        h: Matrix,
+        exposure_s: float,
+        lens: Lens | None = None,
+        combed: bool = False,
+    ) -> None:
+        """`h` is to pixels as a lens that bends nothing would show them. `combed` pictures are
+        woven of two fields: their blur has two teeth, and a middle that is the mean of both."""
         self._appearance = appearance
         self._exposure_s = exposure_s
+        self._lens = lens
+        self._mean_s2 = 0.0 if combed else exposure_s**2 / 24
+        """The mean of a path over the exposure lies beyond its middle by the acceleration times
+        this."""
+        self._may_smear = exposure_s > 0 and not combed
+        if self._may_smear:
+            smear(0.0, smeared=False)
+            smear(0.0, smeared=True)
         self._h = [[float(v) for v in row] for row in h / h[2, 2]]
-        at_px = np.column_stack((appearance.x_px, appearance.y_px))
-        at_mm = to_marker_mm(h, at_px)
+        seen_px = np.column_stack((appearance.x_px, appearance.y_px))
+        at_mm = to_marker_mm(h, undistort_px(lens, seen_px))
         self.reference_mm = at_mm
         """The circles in the marker plane at rest, (n, 2)."""
         centre = at_mm.mean(axis=0)
         self._centre = (float(centre[0]), float(centre[1]))
         self._arms = [(float(x), float(y)) for x, y in at_mm - centre]
-        back = np.linalg.inv(jacobian_px_per_mm(h, at_mm))
-        self._back = [tuple(float(v) for v in m.ravel()) for m in back]
-        self._raster = tuple(
-            raster(shape, edge, appearance.row_step)
-            for shape, edge in zip(appearance.moments_px2, appearance.edge_px, strict=True)
-        )
+        maps = [self._map(float(x), float(y))[2:] for x, y in at_mm]
+        self._back = [
+            tuple(np.linalg.inv(np.reshape(slopes, (2, 2))).ravel().tolist()) for slopes in maps
+        ]
+        self._px_per_mm = float(np.linalg.norm(np.reshape(maps[0], (2, 2)), 2))
+        self._edge_px = float(np.mean(appearance.edge_px))
+        self._rasters = [
+            tuple(
+                raster(shape, edge, appearance.row_step, smeared)
+                for shape, edge in zip(appearance.moments_px2, appearance.edge_px, strict=True)
+            )
+            for smeared in ((False, True) if self._may_smear else (False,))
+        ]
+        """For the usual weights and for those of smeared edges."""
         self._spread = tuple(
             spread_px2(shape, edge, appearance.row_step)
             for shape, edge in zip(appearance.moments_px2, appearance.edge_px, strict=True)
         )
 
+    def _map(self, x_mm: float, y_mm: float) -> tuple[float, float, float, float, float, float]:
+        """Return where a point of the marker plane is seen, and d(px)/d(mm), row by row."""
+        (h00, h01, h02), (h10, h11, h12), (h20, h21, _) = self._h
+        depth = h20 * x_mm + h21 * y_mm + 1.0
+        u, v = (h00 * x_mm + h01 * y_mm + h02) / depth, (h10 * x_mm + h11 * y_mm + h12) / depth
+        j00, j01 = (h00 - u * h20) / depth, (h01 - u * h21) / depth
+        j10, j11 = (h10 - v * h20) / depth, (h11 - v * h21) / depth
+        if self._lens is None:
+            return u, v, j00, j01, j10, j11
+        u, v, d00, d01, d10, d11 = distort_point(self._lens, u, v)
+        return (
+            u,
+            v,
+            d00 * j00 + d01 * j10,
+            d00 * j01 + d01 * j11,
+            d10 * j00 + d11 * j10,
+            d10 * j01 + d11 * j11,
+        )
+
     def at(
         self,
-        pose: tuple[float, float, float],
-        velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        pose: Triple,
+        velocity: Triple = (0.0, 0.0, 0.0),
+        acceleration: Triple = (0.0, 0.0, 0.0),
+        doubt: Triple = (0.0, 0.0, 0.0),
         slack_px: float = 0.0,
+        smeared: bool | None = None,
     ) -> Expected:
         """Return what to expect of the marker at a pose.
 
-        `pose` is x_mm, y_mm and rotation_mrad from rest, `velocity` the same per second; `slack_px`
-        is how far off the pose may be.
+        `pose` is x_mm, y_mm and rotation_mrad from rest, `velocity` and `acceleration` the same per
+        second and second^2, which may be off by `doubt`; `slack_px` is how far off the pose may be.
+        `smeared` asks for one or the other weights; None leaves it to the way.
         """
         seen = self._appearance
         c, s = math.cos(pose[2] / 1000), math.sin(pose[2] / 1000)
-        turn = velocity[2] / 1000
-        (h00, h01, h02), (h10, h11, h12), (h20, h21, _) = self._h
+        turn, bend = velocity[2] / 1000, acceleration[2] / 1000
+        if smeared is None:
+            way_px = math.hypot(velocity[0], velocity[1]) * self._exposure_s * self._px_per_mm
+            smeared = self._may_smear and way_px > SMEARED_WAY * self._edge_px
         xs, ys, areas, shapes, rasters, spreads, blurs = [], [], [], [], [], [], []
-        travels, reaches = [], []
-        room = 0.0
+        shifts, travels, reaches = [], [], []
+        room = longest = 0.0
         for k, ((ax, ay), (b00, b01, b10, b11)) in enumerate(
             zip(self._arms, self._back, strict=True)
         ):
             arm_x, arm_y = c * ax - s * ay, s * ax + c * ay
-            x, y = self._centre[0] + arm_x + pose[0], self._centre[1] + arm_y + pose[1]
-            depth = h20 * x + h21 * y + 1.0
-            u, v = (h00 * x + h01 * y + h02) / depth, (h10 * x + h11 * y + h12) / depth
-            j00, j01 = (h00 - u * h20) / depth, (h01 - u * h21) / depth
-            j10, j11 = (h10 - v * h20) / depth, (h11 - v * h21) / depth
+            u, v, j00, j01, j10, j11 = self._map(
+                self._centre[0] + arm_x + pose[0], self._centre[1] + arm_y + pose[1]
+            )
             # Pixels at rest -> marker plane, turned -> pixels here.
             r00, r01 = c * b00 - s * b10, c * b01 - s * b11
             r10, r11 = s * b00 + c * b10, s * b01 + c * b11
             a00, a01 = j00 * r00 + j01 * r10, j00 * r01 + j01 * r11
             a10, a11 = j10 * r00 + j11 * r10, j10 * r01 + j11 * r11
-            speed_x = velocity[0] - turn * arm_y
-            speed_y = velocity[1] + turn * arm_x
+            speed_x, speed_y = velocity[0] - turn * arm_y, velocity[1] + turn * arm_x
             way_x = (j00 * speed_x + j01 * speed_y) * self._exposure_s
             way_y = (j10 * speed_x + j11 * speed_y) * self._exposure_s
+            mean_x = (acceleration[0] - bend * arm_y - turn * turn * arm_x) * self._mean_s2
+            mean_y = (acceleration[1] + bend * arm_x - turn * turn * arm_y) * self._mean_s2
+            blur = _blurred(
+                (way_x, way_y),
+                (j00 * mean_x + j01 * mean_y, j10 * mean_x + j11 * mean_y),
+                seen.edge_px[k],
+                self._spread[k],
+                smeared,
+            )
             edge_x, edge_y = seen.edge_px[k]
             wx, wy = edge_x * edge_x / 2, edge_y * edge_y / 2
             xx, xy, yy = seen.moments_px2[k]
             xx, yy = xx - wx, yy - wy
+            gain_xx, gain_xy, gain_yy = blur.moments_px2
             xs.append(u)
             ys.append(v)
             areas.append(seen.area_px[k] * (a00 * a11 - a01 * a10))
             shapes.append(
                 (
-                    a00 * a00 * xx
-                    + 2 * a00 * a01 * xy
-                    + a01 * a01 * yy
-                    + wx
-                    + BLUR_MOMENT * way_x * way_x,
-                    a00 * a10 * xx
-                    + (a00 * a11 + a01 * a10) * xy
-                    + a01 * a11 * yy
-                    + BLUR_MOMENT * way_x * way_y,
-                    a10 * a10 * xx
-                    + 2 * a10 * a11 * xy
-                    + a11 * a11 * yy
-                    + wy
-                    + BLUR_MOMENT * way_y * way_y,
+                    a00 * a00 * xx + 2 * a00 * a01 * xy + a01 * a01 * yy + wx + gain_xx,
+                    a00 * a10 * xx + (a00 * a11 + a01 * a10) * xy + a01 * a11 * yy + gain_xy,
+                    a10 * a10 * xx + 2 * a10 * a11 * xy + a11 * a11 * yy + wy + gain_yy,
                 )
             )
             flat = math.exp(-((math.pi * way_y / seen.row_step) ** 2) / 12)
-            y_px, area, yy_px2 = self._raster[k]
+            y_px, area, yy_px2 = self._rasters[smeared][k]
             rasters.append(Raster(y_px * flat, area * flat, yy_px2 * flat))
-            gx = math.sqrt(1 + way_x * way_x / (12 * edge_x * edge_x))
-            gy = math.sqrt(1 + way_y * way_y / (12 * edge_y * edge_y))
-            sxx, sxy, syy = self._spread[k]
-            spreads.append((sxx * gx, sxy * math.sqrt(gx * gy), syy * gy))
+            spreads.append(blur.spread_px2)
             blurs.append((way_x, way_y))
+            longest = max(longest, math.hypot(way_x, way_y) / self._edge_px)
+            shifts.append(blur.shift_px)
             travels.append(math.hypot(u - seen.x_px[k], v - seen.y_px[k]))
             reach_x, reach_y = 2 * math.sqrt(xx), 2 * math.sqrt(yy)
             reaches.append(
@@ -191,6 +245,12 @@ class Forecast:
                     abs(a10) * reach_x + abs(a11 - 1) * reach_y,
                 ),
             )
+        doubt_mm = math.hypot(doubt[0], doubt[1])
+        doubt_px = (
+            doubt_mm * self._mean_s2 * self._px_per_mm * smear(longest, smeared).missing_along
+            if doubt_mm
+            else 0.0
+        )
         return Expected(
             tuple(xs),
             tuple(ys),
@@ -202,9 +262,63 @@ class Forecast:
             tuple(rasters),
             tuple(spreads),
             tuple(blurs),
+            tuple(shifts),
+            doubt_px,
+            smeared,
             tuple(travels),
             tuple(reaches),
         )
+
+
+class _Blur(NamedTuple):
+    moments_px2: Shape
+    """What the second moments gain."""
+    spread_px2: Shape
+    shift_px: tuple[float, float]
+
+
+def _blurred(
+    way_px: tuple[float, float],
+    mean_px: tuple[float, float],
+    edge_px: tuple[float, float],
+    spread: Shape,
+    smeared: bool,
+) -> _Blur:
+    """Return what an exposure does to a circle that goes `way_px` in it, and whose mean place lies
+    `mean_px` beyond that at its middle."""
+    way_x, way_y = way_px
+    length = math.hypot(way_x, way_y)
+    if length < LEAST_WAY * edge_px[0]:
+        return _Blur((0.0, 0.0, 0.0), spread, (0.0, 0.0))
+    x, y = way_x / length, way_y / length
+    width = math.hypot(x * edge_px[0], y * edge_px[1])
+    blur = smear(length / width, smeared)
+    square = width * width
+    along, across = blur.moment_along * square, blur.moment_across * square
+    mean_along = mean_px[0] * x + mean_px[1] * y
+    shift_along = (blur.missing_along - blur.missing_across) * mean_along
+    # The noise grows by the root of these along the way and across it.
+    grow_along, grow_across = math.sqrt(blur.noise_along), math.sqrt(blur.noise_across)
+    m00 = grow_along * x * x + grow_across * y * y
+    m01 = (grow_along - grow_across) * x * y
+    m11 = grow_along * y * y + grow_across * x * x
+    sxx, sxy, syy = spread
+    return _Blur(
+        (
+            along * x * x + across * y * y,
+            (along - across) * x * y,
+            along * y * y + across * x * x,
+        ),
+        (
+            m00 * m00 * sxx + 2 * m00 * m01 * sxy + m01 * m01 * syy,
+            m00 * m01 * sxx + (m00 * m11 + m01 * m01) * sxy + m01 * m11 * syy,
+            m01 * m01 * sxx + 2 * m01 * m11 * sxy + m11 * m11 * syy,
+        ),
+        (
+            blur.missing_across * mean_px[0] + shift_along * x,
+            blur.missing_across * mean_px[1] + shift_along * y,
+        ),
+    )
 
 
 def first_look(
@@ -230,16 +344,21 @@ def first_look(
         (NO_RASTER,) * n,
         tuple(spread_px2(shape, (1.0, 1.0), 1) for shape in shapes),
         ((0.0, 0.0),) * n,
+        ((0.0, 0.0),) * n,
+        0.0,
+        False,
         (0.0,) * n,
         tuple((a + EDGE_PX, b + EDGE_PX) for a, b in semi_axes_px),
     )
 
 
-def raster(shape: Shape, edge_px: tuple[float, float], row_step: int) -> Raster:
+def raster(
+    shape: Shape, edge_px: tuple[float, float], row_step: int, smeared: bool = False
+) -> Raster:
     """Return what the rows' raster does to a circle of which every `row_step`-th row is seen.
 
-    The edge's profile is known, so this sums the weights of such a disc for every position between
-    two rows.
+    The edge's profile is known, so this sums the weights (the usual ones, or those for `smeared`
+    edges) of such a disc for every position between two rows.
     """
     fine = 16
     width_x, width_y = edge_px
@@ -259,7 +378,7 @@ def raster(shape: Shape, edge_px: tuple[float, float], row_step: int) -> Raster:
     f = np.fft.rfftfreq(len(y), 1 / fine)[:, None]
     blur = np.exp(-2 * (math.pi * width_y * f) ** 2)
     part = np.fft.irfft(np.fft.rfft(sharp, axis=0) * blur, len(y), axis=0)
-    along = weight(part).sum(axis=1).reshape(-1, period)
+    along = weight(part, smeared).sum(axis=1).reshape(-1, period)
     rows = y.reshape(-1, period)
     area = along.sum(axis=0)
     mean = (along * rows).sum(axis=0) / area

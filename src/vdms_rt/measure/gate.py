@@ -38,6 +38,7 @@ class Gate:
 
     def __init__(self, shapes: tuple[Shape, ...], margin_px: int, row_step: int) -> None:
         n = self.count = len(shapes)
+        self.margin_px = margin_px
         self.half_width = math.ceil(2 * math.sqrt(max(s[0] for s in shapes)) + margin_px)
         reach_y = 2 * math.sqrt(max(s[2] for s in shapes)) + margin_px
         self.half_height = math.ceil(reach_y / row_step)
@@ -166,7 +167,10 @@ class Workspace:
         self.table = np.zeros(65536, np.float32)
         """Weights, a block of 256 for each zone."""
         self.table[256 * DISC : 256 * EDGE] = 1
-        self._blocks: list[tuple[int, int] | None] = [None] * (256 - EDGE)
+        self.read: list[tuple[int, int, int, int]] = []
+        """Rectangles of the frame that were looked at since this was last cleared: left, top, right
+        and bottom in pixels, the last two exclusive. What records pixels keeps these too."""
+        self._blocks: list[tuple[int, int, bool] | None] = [None] * (256 - EDGE)
 
     def gate(self, shapes: tuple[Shape, ...], margin_px: int, row_step: int) -> Gate:
         key = (shapes, margin_px, row_step)
@@ -177,11 +181,11 @@ class Workspace:
             gate = self._gates[key] = Gate(*key)
         return gate
 
-    def set_weights(self, levels: list[list[float]]) -> None:
+    def set_weights(self, levels: list[list[float]], smeared: bool) -> None:
         """Write each circle's block of the table; levels begin with ground and disc, in grey."""
         blocks = self._blocks
         for k, (ground, disc, _, _) in enumerate(levels):
-            block = (round(STEPS * ground), round(STEPS * (disc - ground)))
+            block = (round(STEPS * ground), round(STEPS * (disc - ground)), smeared)
             if block != blocks[k]:
                 start = 256 * (EDGE + k)
                 self.table[start : start + 256] = weight_table(*block)

@@ -133,6 +133,43 @@ def distort_px(lens: Lens | None, ideal_px: Points) -> Points:
     return np.asarray(lens.centre_px + offsets * stretch[..., None])
 
 
+def distort_point(
+    lens: Lens, x_px: float, y_px: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return where the lens shows one point that belongs at (x_px, y_px), and d(seen)/d(ideal)
+    there, row by row: `distort_px` and its slope in plain floats, for where time counts.
+
+    For points near the picture; beyond the fold the answer is some place outside of it.
+    """
+    off_x, off_y = x_px - lens.centre_px[0], y_px - lens.centre_px[1]
+    row = off_x / lens.pixel_aspect
+    ideal = math.hypot(row, off_y) / lens.half_diagonal_px
+    k1, k2 = lens.k1, lens.k2
+    rho = ideal
+    for _ in range(8):
+        square = rho * rho
+        error = rho * (1 - square * (k1 + k2 * square)) - ideal
+        slope = max(1 - square * (3 * k1 + 5 * k2 * square), 0.1)
+        rho -= error / slope
+        if abs(error) < 1e-12:
+            break
+    square = rho * rho
+    shrink = 1 - square * (k1 + k2 * square)
+    off_x, off_y = off_x / shrink, off_y / shrink
+    bend = -2 * (k1 + 2 * k2 * square) / lens.half_diagonal_px**2
+    to_x, to_y = bend * off_x / lens.pixel_aspect**2, bend * off_y
+    a, b, c, d = shrink + off_x * to_x, off_x * to_y, off_y * to_x, shrink + off_y * to_y
+    det = a * d - b * c
+    return (
+        lens.centre_px[0] + off_x,
+        lens.centre_px[1] + off_y,
+        d / det,
+        -b / det,
+        -c / det,
+        a / det,
+    )
+
+
 def undistort_jacobian(lens: Lens | None, points_px: Points) -> NDArray[np.float64]:
     """Return d(ideal px)/d(seen px) at seen points (n, 2), as (n, 2, 2): row = ideal axis.
 

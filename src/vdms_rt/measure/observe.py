@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from vdms_rt.measure.expect import Expected
@@ -10,12 +10,16 @@ from vdms_rt.measure.gate import Workspace
 from vdms_rt.measure.homography import Rows, to_marker
 from vdms_rt.measure.radial import edge_fit
 from vdms_rt.measure.rigid import Motion, Point, Spread, agreeing_motion
-from vdms_rt.measure.smooth import CircleReading, Slow, measure
+from vdms_rt.measure.smooth import CircleReading, Slow, measure, moves
 from vdms_rt.measure.validity import Limits, judge
 from vdms_rt.model import UNUSABLE_CIRCLE, CircleFlag, Luma
 
 MISFIT_LIMIT = 4.5
 """Standard deviations; with two coordinates a good circle exceeds them once in 25 000 times."""
+SHIFT_SHARE = 0.05
+"""How far the shift to the mean over an exposure is known."""
+REFIT_SHARE = 0.5
+"""The same for a circle that is measured by its edge, for which it is only like that."""
 NEAR_PX = 1.0
 FAR_PX = 3.0
 """How well a disturbed circle's place is known with and without other circles in the picture."""
@@ -30,21 +34,55 @@ def observe(
     slow: Slow,
     work: Workspace,
     frame_height_px: int,
+    refined: Callable[[Sequence[CircleReading]], Expected],
 ) -> tuple[list[CircleReading], list[CircleFlag], Slow]:
     """Return a marker's circles in one picture, their flags, and the next slow figures.
 
     `image` is as for `smooth.measure`. A circle whose look is wrong is measured by what is left of
     its edge: if that succeeds it is REFITTED and may be used, else it keeps the flags that say what
-    is wrong.
+    is wrong. `refined` tells, where the exposure blurs the picture, what the marker should look
+    like now that it is known where it is: the velocity that was foretold would not do for that.
     """
     readings, later = measure(image, row_offset, row_step, expected, slow, work)
+    moving = moves(expected)
+    if moving:
+        expected = refined(readings)
     noise_grey = slow.variance_grey2**0.5
     flags = judge(readings, expected, limits, noise_grey, image.shape[1], frame_height_px)
     for flag in flags:
         if flag is not CircleFlag.NONE:
-            _refit(image, row_offset, row_step, expected, limits, slow, readings, flags)
+            _refit(image, row_offset, row_step, expected, limits, slow, readings, flags, work)
             break
+    if moving:
+        readings = [
+            _shifted(
+                reading,
+                shift,
+                REFIT_SHARE if flag & CircleFlag.REFITTED else SHIFT_SHARE,
+                expected.doubt_px,
+            )
+            for reading, shift, flag in zip(readings, expected.shift_px, flags, strict=True)
+        ]
     return readings, flags, later
+
+
+def _shifted(
+    reading: CircleReading, shift_px: tuple[float, float], share: float, doubt_px: float
+) -> CircleReading:
+    """Return a reading moved to the mean over the exposure; of the shift, `share` and `doubt_px`
+    are uncertain."""
+    x, y = shift_px
+    xx, xy, yy = reading.covariance_px2
+    part, doubt = share * share, doubt_px * doubt_px
+    return reading._replace(
+        x_px=reading.x_px + x,
+        y_px=reading.y_px + y,
+        covariance_px2=(
+            xx + part * x * x + doubt,
+            xy + part * x * y,
+            yy + part * y * y + doubt,
+        ),
+    )
 
 
 def _refit(
@@ -56,6 +94,7 @@ def _refit(
     slow: Slow,
     readings: list[CircleReading],
     flags: list[CircleFlag],
+    work: Workspace,
 ) -> None:
     good = [k for k, flag in enumerate(flags) if not flag & UNUSABLE_CIRCLE]
     off_x = off_y = 0.0
@@ -77,6 +116,7 @@ def _refit(
             limits.contrast_grey[k],
             slow.variance_grey2,
             NEAR_PX if good else FAR_PX,
+            work.read,
         )
         if fit is not None:
             readings[k] = fit

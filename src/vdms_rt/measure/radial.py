@@ -61,21 +61,38 @@ def edge_fit(
     contrast_grey: float,
     variance_grey2: float,
     reach_px: float = 1.0,
+    read: list[tuple[int, int, int, int]] | None = None,
 ) -> CircleReading | None:
     """Return a circle's centre from the undisturbed part of its edge; None if that is too little.
 
     `start_px` may be off by `reach_px`; `shape` are the second moments that the circle should
     have, `edge_px` the widths of its edge, `contrast_grey` that of disc over ground (negative for a
     dark disc). The covariance is that of the edge which was used. The area is that of the fitted
-    ellipse; the levels are medians over the sectors.
+    ellipse; the levels are medians over the sectors. The rectangles that were looked at are added
+    to `read`, as to `Workspace.read`.
     """
     x, y = start_px
     size = 0.0
     radius, whole = _outline_of(shape)
     reach = min(reach_px, radius / 4)
     for _ in range(_PASSES):
+        if math.hypot(x - start_px[0], y - start_px[1]) > reach_px + MAX_SIZE_PX:
+            return None
+        box = _box(image, row_offset, row_step, (x, y), _grown(shape, size), reach)
+        if box is None:
+            return None
+        if read is not None:
+            left, top, right, bottom = box
+            read.append(
+                (
+                    left,
+                    top * row_step + row_offset,
+                    right,
+                    (bottom - 1) * row_step + row_offset + 1,
+                )
+            )
         sectors = _sectors(
-            image, row_offset, row_step, (x, y), size, shape, edge_px, contrast_grey, reach
+            image, row_offset, row_step, (x, y), size, shape, edge_px, contrast_grey, reach, box
         )
         if sectors is None:
             return None
@@ -116,21 +133,15 @@ def _sectors(
     edge_px: tuple[float, float],
     contrast_grey: float,
     reach: float,
+    box: tuple[int, int, int, int],
 ) -> _Sectors | None:
     """Look at the edge in sectors. `reach` widens the edge's zone, to find an edge far away."""
     grown = _grown(shape, size)
     radius, whole = _outline_of(grown)
     zone = min(EDGE_PX, 0.45 * radius) + reach
-    side_x, side_y = (2 * math.sqrt(grown[i]) + zone + FLAT_PX + 1 for i in (0, 2))
-    rows, columns = image.shape
-    left = max(0, math.floor(centre[0] - side_x))
-    right = min(columns, math.ceil(centre[0] + side_x) + 1)
-    top = max(0, math.floor((centre[1] - side_y - row_offset) / row_step))
-    bottom = min(rows, math.ceil((centre[1] + side_y - row_offset) / row_step) + 1)
-    if right - left < 3 or bottom - top < 3:
-        return None
-    x = np.arange(left, right) - centre[0]
-    y = (np.arange(top, bottom) * row_step + row_offset - centre[1])[:, None]
+    left, top, right, bottom = box
+    x = np.arange(left, right, dtype=np.float64) - centre[0]
+    y = np.arange(top, bottom, dtype=np.float64)[:, None] * row_step + row_offset - centre[1]
     distance, normal_x, normal_y = distance_px(grown, x, y)
     near = abs(distance) < zone + FLAT_PX
     grey = image[top:bottom, left:right][near].astype(np.float64)
@@ -140,6 +151,8 @@ def _sectors(
     sector = ((turn / (2 * math.pi) + 0.5) * count).astype(np.int64) % count
 
     edge, ground, disc = abs(d) <= zone, d > zone, d < -zone
+    if not (edge.any() and ground.any()):
+        return None
 
     def per_sector(values: NDArray[np.float64], at: NDArray[np.bool_]) -> NDArray[np.float64]:
         return np.bincount(sector[at], weights=values[at], minlength=count).astype(np.float64)
@@ -182,6 +195,27 @@ def _sectors(
         disc_grey[good],
         ground_grey[good],
     )
+
+
+def _box(
+    image: Luma,
+    row_offset: int,
+    row_step: int,
+    centre: tuple[float, float],
+    shape: Shape,
+    reach: float,
+) -> tuple[int, int, int, int] | None:
+    """Return the columns and the image's rows that hold a circle and its flat ground: left, top,
+    right, bottom, the last two exclusive; None where that is outside of the picture."""
+    radius, _ = _outline_of(shape)
+    side = min(EDGE_PX, 0.45 * radius) + reach + FLAT_PX + 1
+    side_x, side_y = 2 * math.sqrt(shape[0]) + side, 2 * math.sqrt(shape[2]) + side
+    rows, columns = image.shape
+    left = max(0, math.floor(centre[0] - side_x))
+    right = min(columns, math.ceil(centre[0] + side_x) + 1)
+    top = max(0, math.floor((centre[1] - side_y - row_offset) / row_step))
+    bottom = min(rows, math.ceil((centre[1] + side_y - row_offset) / row_step) + 1)
+    return None if right - left < 3 or bottom - top < 3 else (left, top, right, bottom)
 
 
 def _robust(

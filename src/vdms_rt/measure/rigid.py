@@ -12,6 +12,10 @@ from dataclasses import dataclass
 LEAST_CIRCLES = 3
 """Two circles fix x, y and rotation, and would hide a wrong one; the third can contradict."""
 
+BIRGE_LIMIT = (5.4, 4.1)
+"""Quantile 0.999 of chi-square over its degrees of freedom, for three circles (3) and for four
+(5); more of them lie below."""
+
 Point = tuple[float, float]
 Spread = tuple[float, float, float]
 """A symmetric 2 x 2 matrix: xx, xy, yy."""
@@ -30,6 +34,8 @@ class Motion:
     """Root mean square distance of the circles that were used from the rigid marker."""
     covariance: Symmetric
     """Of (x mm, y mm, rotation rad), from the errors of the circles of this picture."""
+    chi2: float
+    """Weighted squares of the used circles' residuals over their degrees of freedom, 2 n - 3."""
     misfit: tuple[float, ...]
     """Of every circle, used or not: its distance from where the *other* used circles say it is, in
     standard deviations of that distance (Baarda 1968); for a good one its square is chi-square
@@ -84,7 +90,7 @@ def rigid_motion(
         # What a step leaves is its square's half of the arms: below a nanometre.
         if abs(step_r) < 1e-5:
             break
-    squares = 0.0
+    squares = chi2 = 0.0
     misfit = []
     for usable, (tx, ty), (rx, ry), (cxx, cxy, cyy) in zip(
         good, turned, residuals, covariance_mm2, strict=True
@@ -104,12 +110,15 @@ def rigid_motion(
         )
         if usable:
             squares += rest_x * rest_x + rest_y * rest_y
+            wxx, wxy, wyy = _inverse((cxx, cxy, cyy))
+            chi2 += wxx * rest_x * rest_x + 2 * wxy * rest_x * rest_y + wyy * rest_y * rest_y
     return Motion(
         x_mm=shift_x,
         y_mm=shift_y,
         rotation_mrad=1000 * angle,
         residual_mm=math.sqrt(squares / len(used)),
         covariance=covariance,
+        chi2=chi2 / (2 * len(used) - 3),
         misfit=tuple(misfit),
         used=tuple(good),
     )
@@ -148,14 +157,17 @@ def position_covariance(
     """Return the covariance of (x_mm, y_mm), the reference's own share included.
 
     `reference_covariance_mm2` is that of the circles' reference positions as the current picture
-    sees them: their errors carry over to every later sample just as a picture's own do.
+    sees them: their errors carry over to every later sample just as a picture's own do. Where the
+    circles disagree by more than noise does, in one picture of a thousand, something else is at
+    work on them, and their covariances count for as much more (Birge 1932).
     """
     arms = _arms(reference_mm)
     used = [k for k, usable in enumerate(motion.used) if usable]
     weights = [_inverse(reference_covariance_mm2[k]) for k in used]
     own_xx, own_xy, _, own_yy, _, _ = motion.covariance
     xx, xy, _, yy, _, _ = _covariance([arms[k] for k in used], weights)
-    return own_xx + xx, own_xy + xy, own_yy + yy
+    more = motion.chi2 if motion.chi2 > BIRGE_LIMIT[len(used) > LEAST_CIRCLES] else 1.0
+    return more * own_xx + xx, more * own_xy + xy, more * own_yy + yy
 
 
 def _arms(reference_mm: Sequence[Point]) -> list[Point]:

@@ -20,11 +20,13 @@ EDGE_REACH_PX = 2.2
 """Of the blurred edge beside its middle, with what the rounding to whole pixels adds."""
 RASTER_SHARE = 0.05
 """How far the raster's pull is known: its model takes the edge as a Gaussian's."""
-MAX_PASSES = 4
+MAX_PASSES = 12
 REFRESH_PICTURES = 32
 """Every so many pictures one circle's slow figures are measured anew."""
 LIGHT_LIMIT = 5.0
 """Standard deviations of the slope of light on a disc beyond which it has changed."""
+LEAST_WAY_PX2 = 0.1
+"""Squared way in an exposure from which on the widths of the edge are not those of the optics."""
 _MEMORY = 1 / 16
 _TURN = 2 * math.pi
 _new = tuple.__new__
@@ -81,24 +83,56 @@ def measure(
     tops = [round((y - row_offset) / row_step) - half_height for y in expected.y_px]
     variance = slow.variance_grey2
     for passes_left in range(MAX_PASSES - 1, -1, -1):
-        moments, levels = _sums(image, gate, lefts, tops, work)
+        for left, top in zip(lefts, tops, strict=True):
+            first = top * row_step + row_offset
+            work.read.append(
+                (left, first, left + gate.width, first + (gate.height - 1) * row_step + 1)
+            )
+        moments, levels = _sums(image, gate, lefts, tops, expected.smeared, work)
         readings, escaped, relit = _read(
             moments, levels, lefts, tops, row_offset, row_step, gate, expected, variance
         )
-        if not (escaped and passes_left):
+        if not escaped:
             break
+        if not passes_left:
+            return _without_escaped(readings, lefts, tops, row_offset, row_step, gate), slow
         for k, m in enumerate(moments):
             lefts[k] += round(m[1] / m[0])
             tops[k] += round(m[3] / m[0])
     if relit:
         for k in _changed(levels, expected, gate, variance):
-            _divide_light(gate, k, moments, levels, expected.light_per_px[k], variance)
+            _divide_light(gate, k, moments, levels, expected, variance)
         readings, _, _ = _read(
             moments, levels, lefts, tops, row_offset, row_step, gate, expected, variance
         )
-    if slow.pictures % REFRESH_PICTURES:
+    if slow.pictures % REFRESH_PICTURES or moves(expected):
         return readings, Slow(variance, slow.edge_px, slow.pictures + 1)
     return readings, _refreshed(slow, gate)
+
+
+def moves(expected: Expected) -> bool:
+    """Return whether the exposure blurs the circles' edges."""
+    return max(way_x * way_x + way_y * way_y for way_x, way_y in expected.blur_px) > LEAST_WAY_PX2
+
+
+def _without_escaped(
+    readings: list[CircleReading],
+    lefts: list[int],
+    tops: list[int],
+    row_offset: int,
+    row_step: int,
+    gate: Gate,
+) -> list[CircleReading]:
+    """Return the readings with no area for circles whose edge may have left its zone: the gate did
+    not catch up with them, and what it shows is not the circle."""
+    reach = gate.margin_px - EDGE_REACH_PX
+    return [
+        r
+        if abs(r.x_px - left - gate.half_width) <= reach
+        and abs(r.y_px - (top + gate.half_height) * row_step - row_offset) <= reach
+        else r._replace(area_px=math.nan)
+        for r, left, top in zip(readings, lefts, tops, strict=True)
+    ]
 
 
 def _read(
@@ -182,7 +216,7 @@ def _read(
 
 
 def _sums(
-    image: Luma, gate: Gate, lefts: list[int], tops: list[int], work: Workspace
+    image: Luma, gate: Gate, lefts: list[int], tops: list[int], smeared: bool, work: Workspace
 ) -> tuple[list[list[float]], list[list[float]]]:
     """Return each circle's sums of weight times 1, x, x^2, y, yx, yx^2, y^2, ... about the middle
     of its box, in rows of the image, and its levels (see `Gate.flat_weights`)."""
@@ -190,7 +224,7 @@ def _sums(
     gate.flat[...] = gate.raw_sparse
     np.dot(gate.flat_of_each, gate.flat_weights, out=gate.levels)
     levels: list[list[float]] = gate.levels.tolist()
-    work.set_weights(levels)
+    work.set_weights(levels, smeared)
     np.bitwise_or(gate.raw_rows, gate.zones, out=gate.index_rows)
     cv2.LUT(gate.index_rows, work.table, gate.weights_rows)
     np.matmul(gate.rows_of, gate.weights, out=gate.down_columns)
@@ -220,7 +254,7 @@ def _divide_light(
     k: int,
     moments: list[list[float]],
     levels: list[list[float]],
-    at_rest: tuple[float, float],
+    expected: Expected,
     variance_grey2: float,
 ) -> None:
     """Measure circle k once more with the change of light since rest divided out of its box.
@@ -231,6 +265,7 @@ def _divide_light(
     mean, slope_x, slope_y, rest = gate.plane_on_disc(box)
     if not (rest <= 2 * variance_grey2 + (0.01 * mean) ** 2 and mean >= 1):
         return
+    at_rest = expected.light_per_px[k]
     change_x, change_y = slope_x / mean - at_rest[0], slope_y / mean - at_rest[1]
     light = 1 + change_x * gate.x_px + change_y * gate.y_px
     if light.min() < 0.2:
@@ -240,7 +275,7 @@ def _divide_light(
     disc = float(box[gate.on_disc].mean())
     if abs(disc - ground) < 1:
         return
-    weights = gate.zoned(k, weight((box - ground) / (disc - ground)))
+    weights = gate.zoned(k, weight((box - ground) / (disc - ground), expected.smeared))
     sums = gate.rows_of.astype(np.float64) @ weights @ gate.columns_of.astype(np.float64)
     moments[k] = sums.ravel().tolist()
     levels[k] = [ground, disc, slope_x, slope_y]

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from vdms_rt.measure.centroid import otsu_circle
-from vdms_rt.measure.expect import Forecast
+from vdms_rt.measure.expect import Expected, Forecast
 from vdms_rt.measure.gate import Workspace
-from vdms_rt.measure.homography import jacobian_mm_per_px, to_image_px
+from vdms_rt.measure.homography import to_image_px, to_marker
 from vdms_rt.measure.lens import Lens, undistort_px
 from vdms_rt.measure.motion import mean_displacement, mean_rotation_mrad
 from vdms_rt.measure.observe import motion_of, observe
-from vdms_rt.measure.rigid import Spread, position_covariance
+from vdms_rt.measure.rigid import Point, Spread, position_covariance
 from vdms_rt.measure.smooth import CircleReading
 from vdms_rt.measure.validity import Limits
 from vdms_rt.model import UNUSABLE_CIRCLE, Circle, CircleFlag, MarkerShape, Picture, Status
 from vdms_rt.process.progress import GONE, View, Watch, spread_matrices
 from vdms_rt.process.reference import circle_of, region_at
-from vdms_rt.process.track import REST, Pose, Track
+from vdms_rt.process.track import REST, Course, Pose, Track
 
 GONE_S = 0.3
 """A marker not seen for so long is searched in the whole picture."""
@@ -92,8 +93,22 @@ def _smooth(
     height_px: int,
     work: Workspace,
 ) -> tuple[Seen, Watch]:
-    pose, velocity, slack_px = watch.track.at(picture.t_ns)
-    expected = forecast.at(pose, velocity, slack_px)
+    course = watch.track.ahead(picture.t_ns)
+    expected = forecast.at(
+        course.pose, course.velocity, course.acceleration, slack_px=course.slack_px
+    )
+
+    def refined(readings: Sequence[CircleReading]) -> Expected:
+        nonlocal course
+        course = _course(watch, course, expected, readings, picture.t_ns)
+        return forecast.at(
+            course.pose,
+            course.velocity,
+            course.acceleration,
+            doubt=course.doubt,
+            smeared=expected.smeared,
+        )
+
     readings, flags, slow = observe(
         picture.image,
         picture.row_offset,
@@ -103,8 +118,10 @@ def _smooth(
         watch.slow[picture.kind],
         work,
         height_px,
+        refined,
     )
-    tolerance_mm = BENT_PX * view.mm_per_px + BENT_MM_PER_MM * math.hypot(pose[0], pose[1])
+    way_mm = math.hypot(course.pose[0], course.pose[1])
+    tolerance_mm = BENT_PX * view.mm_per_px + BENT_MM_PER_MM * way_mm
     observation = motion_of(
         _undistorted(watch.lens, readings), flags, watch.back, view.zero_mm, tolerance_mm
     )
@@ -129,7 +146,7 @@ def _smooth(
         status |= Status.RELOCATED
     now: Pose = (motion.x_mm, motion.y_mm, motion.rotation_mrad)
     covariance = position_covariance(motion, view.zero_mm, view.covariance_mm2)
-    seen = Seen(circles, now, covariance, motion.residual_mm, velocity, status)
+    seen = Seen(circles, now, covariance, motion.residual_mm, course.velocity, status)
     track = watch.track.with_pose(picture.t_ns, now) if observation.agree else watch.track
     after = dataclasses.replace(
         watch,
@@ -145,6 +162,26 @@ def _smooth(
         relocated=False,
     )
     return seen, after
+
+
+def _course(
+    watch: Watch,
+    foretold: Course,
+    expected: Expected,
+    readings: Sequence[CircleReading],
+    t_ns: int,
+) -> Course:
+    """Return how a marker moves now that its circles are seen: all of them lie as far from where
+    they were foretold as the one in the middle."""
+    n = len(readings) // 2
+    away_x = sorted(r.x_px - x for r, x in zip(readings, expected.x_px, strict=True))[n]
+    away_y = sorted(r.y_px - y for r, y in zip(readings, expected.y_px, strict=True))[n]
+    shift_x, shift_y = expected.shift_px[0]
+    away_x, away_y = away_x + shift_x, away_y + shift_y
+    (a, b), (c, d) = mm_per_px(watch, foretold.pose)
+    x_mm, y_mm, rotation_mrad = foretold.pose
+    seen = (x_mm + a * away_x + b * away_y, y_mm + c * away_x + d * away_y, rotation_mrad)
+    return watch.track.now(t_ns, seen)
 
 
 def _undistorted(lens: Lens | None, readings: list[CircleReading]) -> list[CircleReading]:
@@ -182,10 +219,10 @@ def shake_px(watch: Watch, pose: Pose) -> tuple[float, float]:
     return float(there[1, 0] - there[0, 0]), float(there[1, 1] - there[0, 1])
 
 
-def mm_per_px(watch: Watch, pose: Pose) -> list[list[float]]:
+def mm_per_px(watch: Watch, pose: Pose) -> tuple[Point, Point]:
     """Return d(mm)/d(px), 2 x 2, at the middle of a marker at a pose."""
     (view, *_) = watch.views.values()
     x, y = view.middle_mm
     at_px = to_image_px(watch.homography, np.array([(x + pose[0], y + pose[1])]))
-    jacobian: list[list[float]] = jacobian_mm_per_px(watch.homography, at_px)[0].tolist()
-    return jacobian
+    _, (a, b, c, d) = to_marker(watch.back, *at_px[0].tolist())
+    return ((a, b), (c, d))

@@ -209,7 +209,10 @@ def _watch(
         forecast = None
         if field_.appearance is not None:
             whole = field_.kind is Scan.PROGRESSIVE
-            forecast = Forecast(field_.appearance, h, woven_s if whole else exposure_s)
+            combed = whole and set_up.scan.interlaced
+            forecast = Forecast(
+                field_.appearance, ideal, woven_s if combed else exposure_s, lens, combed
+            )
         zero_mm = to_marker_mm(ideal, at_px)
         spreads = reference_covariance_mm2(circles_mm, reference_px, variance, at_px).tolist()
         middle_x, middle_y = zero_mm.mean(axis=0).tolist()

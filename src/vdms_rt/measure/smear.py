@@ -1,0 +1,103 @@
+"""What an exposure does to the edge of a moving circle, and how much of it the weights let through.
+
+While the shutter is open a circle goes along a path q(t) = v t + a t^2 / 2. Its edge, of width s
+at rest, is the mean of the edges on that path. Weights that are not proportional to the light do
+not give the path's mean, by a T^2 / 24 beyond its middle, but only a part of that, which depends on
+how the way compares with the edge: what is missing is known, and added. The same integrals give
+what the weighed second moments and the noise gain.
+
+All figures are per unit of s, for a way of `way` edge widths, and averaged over the outline of a
+circle; an ellipse's differ little. A table each for both weights of `edge`.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from vdms_rt.measure.edge import profile, slope, weight
+
+STEP = 0.5
+"""Of the tables, in edge widths."""
+LONGEST = 24.0
+FINE = 1 / 16
+SMEARED_WAY = 3.5
+"""In edge widths: beyond this way the weights that are nearly proportional to the light cost less
+by their noise (7 % at 4 widths, 3 % at 8) than the others by what is known badly of their bias."""
+
+
+class Smear(NamedTuple):
+    """What a way does, along it and across it."""
+
+    missing_along: float
+    """Part of the path's mean that is missing in the centre, where the acceleration is along the
+    way, and (`missing_across`) where it is across."""
+    missing_across: float
+    moment_along: float
+    """What the second moment gains over that of the usual weights at rest, in s^2."""
+    moment_across: float
+    noise_along: float
+    """Factor on the variance that the centre has with the usual weights at rest."""
+    noise_across: float
+
+
+@lru_cache(maxsize=2)
+def _table(smeared: bool) -> tuple[Smear, ...]:
+    d = np.arange(-LONGEST / 2 - 6, LONGEST / 2 + 6, FINE)[:, None]
+    t, share = np.polynomial.legendre.leggauss(48)
+    t, share = t / 2, share / 2
+    ways = np.arange(0, LONGEST + 2 * STEP, STEP)
+    bent = 0.25
+
+    def of_path(way: float, bend: float) -> np.ndarray:
+        edge: np.ndarray = profile(way * t + bend * t * t - d) @ share
+        return edge
+
+    passed, spread, noise = [], [], []
+    at_rest = (d[:, 0] < 0).astype(float)
+    for way in ways.tolist():
+        there, back = (weight(of_path(way, b), smeared) - at_rest for b in (bent, -bent))
+        # Of the mean of bend t^2, which is bend / 12.
+        passed.append(float((there - back).sum()) * FINE * 12 / (2 * bent))
+        edge = of_path(way, 0.0)
+        weighed = weight(edge, smeared)
+        spread.append(2 * FINE * float((weighed - at_rest) @ d[:, 0]))
+        noise.append(float((slope(edge, smeared) ** 2).sum()) * FINE)
+    turn = (np.arange(90) + 0.5) * math.pi / 180
+    cos2, sin2 = np.cos(turn) ** 2, np.sin(turn) ** 2
+    # The size at rest is learnt with the usual weights.
+    resting = of_path(0.0, 0.0)
+    usual = weight(resting)
+    at_rest_noise = FINE * float((slope(resting) ** 2).sum())
+    at_rest_spread = 2 * FINE * float((usual - at_rest) @ d[:, 0])
+    rows = []
+    for way in ways[:-1].tolist():
+        across_edge = way * np.cos(turn)
+        g = np.interp(across_edge, ways, passed)
+        v = np.interp(across_edge, ways, spread) - at_rest_spread
+        n = np.interp(across_edge, ways, noise)
+        # A blurred edge of variance v, and what the way along the edge bends it inwards.
+        rows.append(
+            Smear(
+                missing_along=1 - 2 * float((g * cos2).mean()),
+                missing_across=1 - 2 * float((g * sin2).mean()),
+                moment_along=float((3 * v * cos2 - v / 4).mean()),
+                moment_across=float((3 * v * sin2 - v / 4).mean()) - way * way / 48,
+                noise_along=2 * float((n * cos2).mean()) / at_rest_noise,
+                noise_across=2 * float((n * sin2).mean()) / at_rest_noise,
+            )
+        )
+    return tuple(rows)
+
+
+def smear(way: float, smeared: bool) -> Smear:
+    """Return what a way of so many edge widths does, with the weights for long ways (`smeared`) or
+    the usual ones."""
+    table = _table(smeared)
+    at = min(abs(way) / STEP, len(table) - 1.001)
+    n = int(at)
+    part = at - n
+    return Smear(*(a + part * (b - a) for a, b in zip(table[n], table[n + 1], strict=True)))
