@@ -385,7 +385,7 @@ class Health:
     captured: int
     """Frames taken from the source."""
     missed: int
-    """Frames lost before they came, while others did: an outage is a state, and not counted here."""
+    """Frames lost before they came, while others did: an outage is a state and not counted."""
     damaged: int
     overwritten: int
     """Frames that the process thread was too slow for."""
