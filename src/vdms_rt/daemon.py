@@ -146,6 +146,7 @@ class Daemon:
     def _control_server(self, publisher: Publisher) -> ControlServer:
         desk = Desk(
             station=self._outlet,
+            state=self._state,
             submit=self._processor.commands.submit,
             markers=self.config.marker,
             pixel_aspect=self.config.lens.pixel_aspect,
@@ -300,12 +301,11 @@ class Daemon:
         if len(self._rates) > 1:
             (then_s, then), (now_s, now) = self._rates[0], self._rates[-1]
             rate_hz = (now - then) / (now_s - then_s)
-        state = capture.state if capture.state is not State.STREAMING else process.state
         return Health(
             session=self._outlet.session,
             utc_ns=time.time_ns(),
             uptime_s=time.monotonic() - self._started_s,
-            state=State.STOPPING if self._stop.is_set() else state,
+            state=self._state(),
             device=capture.info.name if capture.info else "",
             captured=capture.captured,
             missed=capture.missed,
@@ -330,6 +330,12 @@ class Daemon:
             clock_rate_ppm=clock.rate_ppm if clock else 0.0,
             utc_state=clock.utc_state if clock else "unknown",
         )
+
+    def _state(self) -> State:
+        if self._stop.is_set():
+            return State.STOPPING
+        capture = self._capture.counters.state
+        return capture if capture is not State.STREAMING else self._processor.counters.state
 
     def _run_header(self) -> bytes:
         info = self._capture.counters.info

@@ -34,7 +34,7 @@ from vdms_rt.config import Marker
 from vdms_rt.control.picture import marker_regions, preview
 from vdms_rt.logfile.listing import list_recordings
 from vdms_rt.measure.axis import StrokeError, measure_stroke
-from vdms_rt.model import Displacement, Event, Region, Scan, Severity
+from vdms_rt.model import Displacement, Event, Region, Scan, Severity, State
 from vdms_rt.setup import SetUp
 from vdms_rt.wire import control_pb2 as control
 from vdms_rt.wire import vdms_pb2 as pb
@@ -85,6 +85,8 @@ class Desk:
     """Used by the control thread alone."""
 
     station: Station
+    state: Callable[[], State]
+    """Of the daemon, this moment."""
     submit: Callable[[Command], Future[Applied | Snapshot]]
     markers: tuple[Marker, ...]
     pixel_aspect: float
@@ -156,10 +158,10 @@ class Desk:
             return future.result(APPLY_S)
         except NotInTime:
             if future.cancel():
-                health = self.station.newest_health
-                state = f" ({health.state})" if health is not None else ""
                 raise Refused(
-                    "no-pictures", f"no pictures come{state}, so nothing was done; ask again then"
+                    "no-pictures",
+                    f"no pictures come ({self.state().value}), so nothing was done; ask again when "
+                    "they do",
                 ) from None
             # It has begun, and no command takes longer than a frame.
             return future.result()
@@ -177,9 +179,10 @@ class Desk:
         if health is None:
             raise Refused("starting", "the station has just started; ask again in a second")
         status.health.CopyFrom(health)
+        status.health.state = self.state().value
         if (set_up := self.station.newest_set_up_message) is not None:
             status.set_up.CopyFrom(set_up)
-        return control.Answer(text=health.state, status=status)
+        return control.Answer(text=status.health.state, status=status)
 
     def _preview(self, request: control.PreviewRequest) -> control.Answer:
         _within("quality", request.quality, 0, 100)
