@@ -42,6 +42,7 @@ STYLE = {
     "pdf.fonttype": 42,
 }
 OTSU, SMOOTH, BOUND = "#c44e52", "#1f5fa8", "0.35"
+METHODS = (("otsu", OTSU, "Otsu mean (paper)"), ("smooth", SMOOTH, "smooth weight"))
 WIDTH_IN = 7.1
 BENCH = Bench(distance_m=8.0, angle_deg=30.0)
 SHOWN_S = 2.0
@@ -92,7 +93,8 @@ def time_histories(seed: int = 1) -> Figure:
             ),
             Line2D([], [], color=SMOOTH, marker=".", ms=4, ls="", label="smooth weight"),
         ]
-        figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False)
+        where = f"{BENCH.distance_m:g} m, {BENCH.angle_deg:g} deg, {_noise(setting.noises_grey[0])}"
+        _legend(figure, handles, where)
     return figure
 
 
@@ -119,6 +121,24 @@ def _history(
     below.set_xlim(0, SHOWN_S)
     for axes in (above, below):
         axes.grid(visible=True)
+
+
+def _noise(noise_grey: float) -> str:
+    return f"noise of {noise_grey:g} grey levels"
+
+
+def _legend(figure: Figure, handles: list[Line2D], title: str) -> None:
+    figure.legend(
+        handles=handles,
+        title=title,
+        title_fontsize=8,
+        loc="outside upper center",
+        ncols=len(handles),
+        columnspacing=1.2,
+        handlelength=1.6,
+        handletextpad=0.5,
+        frameon=False,
+    )
 
 
 def errors(results: Sequence[Result]) -> Figure:
@@ -151,8 +171,11 @@ def errors(results: Sequence[Result]) -> Figure:
                 Line2D([], [], color="0.2", marker=m, ms=3.5, ls="", label=f"{d:g} m")
                 for m, d in zip(itertools.cycle(MARKS), distances, strict=False)
             ),
-            Line2D([], [], color=OTSU, label="Otsu mean (paper)"),
-            Line2D([], [], color=SMOOTH, label="smooth weight"),
+            *(
+                Line2D([], [], color=colour, label=label)
+                for method, colour, label in METHODS
+                if any(r.method == method for r in rows)
+            ),
             Line2D(
                 [],
                 [],
@@ -161,15 +184,13 @@ def errors(results: Sequence[Result]) -> Figure:
                 label="Cram\N{LATIN SMALL LETTER E WITH ACUTE}r-Rao bound",
             ),
         ]
-        figure.legend(
-            handles=handles, loc="outside upper center", ncols=len(handles), frameon=False
-        )
+        _legend(figure, handles, f"1 Hz, {_noise(noise)}")
     return figure
 
 
 def _over_angle(axes: Axes, rows: Sequence[Result], distances: Sequence[float]) -> None:
     angles = sorted({r.angle_deg for r in rows})
-    for method, colour in (("otsu", OTSU), ("smooth", SMOOTH)):
+    for method, colour, _ in METHODS:
         for k, (distance, mark) in enumerate(zip(distances, itertools.cycle(MARKS), strict=False)):
             own = sorted(
                 (r for r in rows if r.method == method and r.distance_m == distance),
