@@ -204,8 +204,17 @@ def test_the_command_writes_rows_table_and_figures(tmp_path, monkeypatch, capsys
         assert (folder / f"{name}.pdf").read_bytes().startswith(b"%PDF")
 
 
-def test_a_number_that_makes_no_sense_is_refused(capsys):
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ("--samples 1", "--samples must be at least 2"),
+        ("--noise-grey 2 0", "--noise-grey must be above 0"),
+        ("--angle-deg 90", "--angle-deg must be from 0 to below 90"),
+        ("--csv nowhere/rows.csv", "there is no folder nowhere; make it first"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_anything_is_measured(asked, told, capsys):
     with pytest.raises(SystemExit) as ended:
-        accuracy.main(["--samples", "1"])
+        accuracy.main(asked.split())
     assert ended.value.code == 2
-    assert "--samples must be at least 2" in capsys.readouterr().err
+    assert told in capsys.readouterr().err

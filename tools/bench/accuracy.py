@@ -140,10 +140,24 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
+def _fault(options: argparse.Namespace) -> str:
+    """Return a sentence for what is wrong with the options, or nothing."""
+    if options.samples < 2 or options.trials < 1 or options.jobs < 1:
+        return "--samples must be at least 2, --trials and --jobs at least 1"
+    for name in ("distance_m", "amplitude_mm", "frequency_hz", "noise_grey"):
+        if any(value <= 0 for value in getattr(options, name) or ()):
+            return f"--{name.replace('_', '-')} must be above 0"
+    if any(not 0 <= angle < 90 for angle in options.angle_deg or ()):
+        return "--angle-deg must be from 0 to below 90"
+    if options.csv and not options.csv.parent.is_dir():
+        return f"--csv: there is no folder {options.csv.parent}; make it first"
+    return ""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parser().parse_args(arguments)
-    if options.samples < 2 or options.trials < 1 or options.jobs < 1:
-        parser().error("--samples must be at least 2, --trials and --jobs at least 1")
+    if fault := _fault(options):
+        parser().error(fault)
     wanted = [*SETS, DISTURBED] if "all" in options.set else options.set
     choice = Choice(
         distances_m=options.distance_m,

@@ -236,7 +236,11 @@ def main() -> None:
     parser.add_argument("csv", type=Path)
     parser.add_argument("folder", type=Path)
     options = parser.parse_args()
-    draw(options.folder, read_csv(options.csv))
+    try:
+        results = read_csv(options.csv)
+    except (OSError, KeyError, ValueError) as error:
+        parser.error(f"{options.csv} is no CSV of tools.bench.accuracy: {error}")
+    draw(options.folder, results)
 
 
 if __name__ == "__main__":
