@@ -200,16 +200,17 @@ def _parser() -> argparse.ArgumentParser:
         verbs,
         "watch",
         _watch,
-        "show a running station's displacement in this terminal",
-        "Connect to a station, here or on another computer, and show numbers, state and a moving "
-        "plot; with --csv also write every sample. A station that stops and comes back is "
-        "picked up again. Ctrl-C ends it.",
+        "show the displacement of running stations in this terminal",
+        "Connect to a station, here or on another computer, or to several, or to the router where "
+        "they all are, and show numbers, states and moving plots; with --csv also write every "
+        "sample. A station that stops and comes back is picked up again. Ctrl-C ends it.",
     )
     verb.add_argument(
         "--connect",
-        default=ctl.DEFAULT_ADDRESS,
+        action="append",
         metavar="ADDRESS",
-        help=f"where the station listens (default: {ctl.DEFAULT_ADDRESS})",
+        help="where a station or a router listens; once for each of several "
+        f"(default: {ctl.DEFAULT_ADDRESS})",
     )
     verb.add_argument("--csv", type=Path, metavar="FILE", help="write every sample to this file")
     verb.add_argument(
@@ -386,4 +387,6 @@ def _keys(arguments: argparse.Namespace) -> int:
 def _watch(arguments: argparse.Namespace) -> int:
     from vdms_rt.watch import run_watch
 
-    return run_watch(arguments.connect, arguments.csv, seconds=arguments.seconds)
+    return run_watch(
+        arguments.connect or ctl.DEFAULT_ADDRESS, arguments.csv, seconds=arguments.seconds
+    )

@@ -41,10 +41,10 @@ def start(endpoint: str, *arguments: str, stdout: int = subprocess.PIPE) -> subp
 
 
 @contextmanager
-def speaking(endpoint: str, session: int = 7) -> Iterator[Publisher]:
+def speaking(endpoint: str, session: int = 7, name: str = "s1") -> Iterator[Publisher]:
     """A station that says a sample each 5 ms, from a thread."""
     stop = threading.Event()
-    with publisher(endpoint) as station:
+    with publisher(endpoint, name) as station:
 
         def speak() -> None:
             seq = 0
@@ -148,3 +148,19 @@ def test_on_a_terminal_it_is_a_screen_that_comes_and_goes() -> None:
         watch.kill()
         watch.wait()
     assert (watch.returncode, err) == (0, "")
+
+
+def test_several_stations_at_several_addresses_are_one_screen_s_worth() -> None:
+    first, second = free_endpoint(), free_endpoint()
+    with speaking(first, name="north"), speaking(second, session=8, name="south"):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "vdms_rt", "watch", "--connect", first, "--connect", second],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for name in ("north/m1", "south/m1"):
+            assert " x " in line_with(process, f"{name}  x")
+        summary = end(process)
+    assert re.search(r"^north/m1: \d+ samples, 0 missed$", summary, re.MULTILINE)
+    assert re.search(r"^south/m1: \d+ samples, 0 missed$", summary, re.MULTILINE)
