@@ -279,7 +279,7 @@ def coverage_table(runs: Sequence[Run]) -> Table:
             add(words.format(value), [r for r in runs if getattr(r.case, field) == value])
     last_s = max(float(r.age_s.max()) for r in runs)
     for ages in itertools.pairwise(AGES_S):
-        if ages[0] < last_s:
+        if ages[0] < last_s - 0.5:
             add(f"{ages[0]:g} to {min(ages[1], last_s):.0f} s old", runs, ages)
     return table
 
