@@ -1,6 +1,7 @@
 """The installed service, as a test and a person see it: systemctl, the journal, its files."""
 
 import subprocess
+import time
 from pathlib import Path
 
 from rig.devices import REPOSITORY, run, wait_for
@@ -58,19 +59,16 @@ def wait_until_measuring() -> str:
         raise AssertionError(f"{error}\n{everything()}") from None
 
 
-def cursor() -> str:
-    """Return the journal's end now, for `journal`."""
-    run("journalctl", "--sync")
-    said = run("journalctl", "--quiet", "--lines=0", "--show-cursor")
-    return said.strip().removeprefix("-- cursor: ")
+def now() -> str:
+    """Return the time, for `journal`."""
+    return f"@{time.time():.6f}"
 
 
-def journal(since: str = "", *options: str) -> list[str]:
-    """Return the service's journal after a cursor: what a person reads, without the time."""
+def journal(since: str = "@0", *options: str) -> list[str]:
+    """Return the service's journal since a time: what a person reads, without the time."""
     run("journalctl", "--sync")
-    after = [f"--after-cursor={since}"] if since else []
     which = [] if "--identifier=vdms-rt" in options else ["--unit=vdms-rt"]
-    said = run("journalctl", "--quiet", "--output=cat", *which, *after, *options)
+    said = run("journalctl", "--quiet", "--output=cat", f"--since={since}", *which, *options)
     return said.splitlines()
 
 

@@ -94,11 +94,22 @@ def test_the_same_process_goes_on_after_a_pulled_cable(grabber: Grabber) -> None
     grabber.plug()
     service.wait_until_measuring()
     assert service.pid() == pid
-    assert service.journal("", "--priority=err") != []
+    assert service.journal("@0", "--priority=err") != []
+
+
+def test_the_sandbox_lets_it_reset_the_grabber(grabber: Grabber) -> None:
+    pid, begun = service.pid(), service.now()
+    grabber.set("wedge", True)
+    reset = "it is reset over USB"
+    wait_for(
+        lambda: any(reset in line for line in service.journal(begun)), reset, service.DEADLINE_S
+    )
+    service.wait_until_measuring()
+    assert service.pid() == pid
 
 
 def test_what_was_killed_comes_back(grabber: Grabber) -> None:
-    pid, begun = service.pid(), service.cursor()
+    pid, begun = service.pid(), service.now()
     os.kill(pid, signal.SIGKILL)
     wait_for(lambda: service.pid() not in (0, pid), "a new process", service.DEADLINE_S)
     service.wait_until("active")
@@ -114,7 +125,7 @@ def test_what_was_killed_comes_back(grabber: Grabber) -> None:
 def test_what_hangs_is_ended_by_the_watchdog(grabber: Grabber) -> None:
     # From here on without frames, which keep the virtual machine so busy that all takes long.
     grabber.unplug()
-    pid, begun = service.pid(), service.cursor()
+    pid, begun = service.pid(), service.now()
     os.kill(pid, signal.SIGSTOP)
     wait_for(lambda: service.pid() not in (0, pid), "a new process", service.DEADLINE_S)
     service.wait_until("active")
@@ -124,7 +135,7 @@ def test_what_hangs_is_ended_by_the_watchdog(grabber: Grabber) -> None:
 
 
 def test_a_wrong_configuration_is_one_line_and_no_restart(installed: str) -> None:
-    right, begun = CONFIG.read_text(), service.cursor()
+    right, begun = CONFIG.read_text(), service.now()
     CONFIG.write_text(right.replace("ring_slots = 64", "ring_slots = 6"))
     run("systemctl", "stop", "vdms-rt")
     subprocess.run(["systemctl", "start", "vdms-rt"], check=False, timeout=service.DEADLINE_S)
