@@ -232,8 +232,13 @@ def refused(capsys, *arguments):
 
 def test_what_cannot_be_exported_is_refused_and_leaves_no_file(recording, capsys, monkeypatch):
     folder = recording.parent
-    assert "no marker m9" in refused(capsys, recording, "--to", "csv", "--marker", "m9")
-    assert "no such file" in refused(capsys, recording, "--to", "csv", "--out", "/none/a.csv")
+    for to in FORMATS:
+        assert "no marker m9" in refused(capsys, recording, "--to", to, "--marker", "m9")
+        assert "no such file" in refused(capsys, recording, "--to", to, "--out", "/none/a")
+        assert "the recording itself" in refused(
+            capsys, recording, "--to", to, "--out", recording, "--force"
+        )
+        assert "not a directory" in refused(capsys, recording, "--to", to, "--out", recording / "a")
     monkeypatch.setattr(tables, "EXCEL_ROWS", 100)
     assert "use --to parquet" in refused(capsys, recording, "--to", "xlsx")
     monkeypatch.setattr("vdms_replay.formats.channels.MATLAB_BYTES", 1000)

@@ -299,7 +299,7 @@ def _write(recording: Recording, table: pd.DataFrame, arguments: argparse.Namesp
         "units": {si_name(n) if si else n: si_unit(u) if si else u for n, u in units.items()},
         "meanings": {si_name(n) if si else n: text for n, text in MEANINGS.items()},
     }
-    target = target_path(recording.paths[0], arguments.to, arguments.out)
+    target = target_path(recording.paths, arguments.to, arguments.out)
     if arguments.out is None:
         target = target.with_name(f"{target.stem}-derived{target.suffix}")
     marker = str(first["marker"])

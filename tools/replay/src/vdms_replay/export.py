@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,7 @@ def export(
         },
         "meanings": {si_name(name) if si else name: text for name, text in MEANINGS.items()},
     }
-    target = target_path(source.paths[0], to, out)
+    target = target_path(source.paths, to, out)
     counts: dict[str, int] = {}
     with writing(target, to, meta, force=force) as writer:
         for table in _batches(source, Clock(), advance, ROWS_AT_ONCE):
@@ -129,10 +129,16 @@ def _batches(
         yield samples.take()
 
 
-def target_path(recording: Path, to: str, out: PathLike | None) -> Path:
-    """Return where the file goes: `out`, or the recording's name with the format's ending."""
-    stem = recording.name.partition(".mcap")[0]
-    return Path(out) if out is not None else recording.with_name(stem + FORMATS[to][0])
+def target_path(recordings: Sequence[Path], to: str, out: PathLike | None) -> Path:
+    """Return where the file goes: `out`, or the first recording's name with the format's ending.
+
+    Raises ReplayError if that is a recording itself.
+    """
+    stem = recordings[0].name.partition(".mcap")[0]
+    target = Path(out) if out is not None else recordings[0].with_name(stem + FORMATS[to][0])
+    if target.resolve() in [path.resolve() for path in recordings]:
+        raise ReplayError(f"{target}: is the recording itself; choose another --out")
+    return target
 
 
 @contextlib.contextmanager
@@ -141,20 +147,26 @@ def writing(path: Path, to: str, meta: dict[str, Any], *, force: bool) -> Iterat
     if path.exists() and not force:
         raise ReplayError(f"{path}: is there already; choose another --out, or --force")
     begun = path.with_name(path.name + ".part")
-    begun.unlink(missing_ok=True)
     try:
+        # Here, since not every library says what is wrong with a place.
+        begun.touch()
+        begun.unlink()
         writer = FORMATS[to][1](begun, meta)
         try:
             yield writer
-        finally:
-            writer.close()
+        except BaseException:
+            with contextlib.suppress(FormatError, OSError):
+                writer.close()
+            raise
+        writer.close()
         begun.replace(path)
     except FormatError as error:
         raise ReplayError(f"{path}: {error}") from None
     except OSError as error:
         raise ReplayError(f"{path}: {(error.strerror or str(error)).lower()}") from None
     finally:
-        begun.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            begun.unlink(missing_ok=True)
 
 
 def _size(path: Path) -> str:
