@@ -187,7 +187,7 @@ def _status_text(status: control.Status) -> str:
         ("lost", f"{health.missed + health.overwritten} frames, {health.invalid} samples invalid"),
         ("recording", health.record_trouble or health.recording or "no"),
         ("run", status.run or "none"),
-        ("disk", f"{health.disk_free_bytes / 1e9:.1f} GB free"),
+        ("disk", f"{health.disk_free_bytes / 1e9:.1f} GB free" if health.recording else "not used"),
         ("clock", f"{health.utc_state}, {health.clock_sigma_us:.0f} us"),
     ]
     lines = [f"{name:<11}{value}" for name, value in rows]
