@@ -37,6 +37,11 @@ check_systemd() {
         die "systemd does not run on this computer, and the service needs it"
 }
 
+check_wheels() {
+    [ -z "$wheels" ] || [ -d "$wheels" ] ||
+        die "WHEELS=$wheels is not a folder; fill one with \`make wheels\` on a computer with internet"
+}
+
 check_python() {
     # Under /home or /root the service's user could not reach it.
     case $(realpath "$(command -v "$python" || echo /nowhere)") in
@@ -72,8 +77,6 @@ fingerprint() {
 
 install_software() {
     local version from=()
-    [ -z "$wheels" ] || [ -d "$wheels" ] ||
-        die "WHEELS=$wheels is not a folder; fill one with \`make wheels\` on a computer with internet"
     version=$(fingerprint)
     if [ ! -e "$home/$version/complete" ]; then
         say "installing the software into $home/$version"
@@ -143,6 +146,7 @@ case ${1:-} in
 '')
     check_root
     check_systemd
+    check_wheels
     check_python
     install_software
     install_service
@@ -151,6 +155,7 @@ case ${1:-} in
     ;;
 software)
     check_root
+    check_wheels
     check_python
     install_software
     ;;
