@@ -159,8 +159,9 @@ class Outlet:
         log.log(logging.WARNING if advised else logging.INFO, set_up_report(set_up))
 
     def set_up(self, set_up: SetUp, image: Luma) -> None:
-        """Say the set-up now in force; `image` is a picture taken with it."""
-        self.newest_set_up = set_up
+        """Say the set-up now in force; `image` is a picture taken with it, which is kept where the
+        reference is new: then it shows the reference pose."""
+        before, self.newest_set_up = self.newest_set_up, set_up
         message = pb.SetUp(
             session=self.session,
             utc_ns=set_up.utc_ns,
@@ -171,7 +172,7 @@ class Outlet:
         )
         self.newest_set_up_message = message
         self._say(topics.SETUP, "", self.now_ns(), message.SerializeToString())
-        if self.recorder is not None:
+        if self.recorder is not None and not _same_reference(before, set_up):
             png = codec.png(image)
             self.recorder.attach("reference.png", "image/png", png)
             now_ns = self.now_ns()
@@ -217,3 +218,10 @@ class Outlet:
         if topic.recorded and self.recorder is not None:
             key = topic.key.format(station=self._station, marker=marker)
             self.recorder.put(topic, key, at_ns, data)
+
+
+def _same_reference(before: SetUp | None, now: SetUp) -> bool:
+    """Return whether two set-ups stand against the same stills."""
+    return before is not None and [m.homography for m in before.markers] == [
+        m.homography for m in now.markers
+    ]

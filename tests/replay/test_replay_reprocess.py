@@ -145,6 +145,26 @@ def test_a_part_from_the_middle_of_a_run_has_the_same_bits(tmp_path: Path) -> No
     assert (whole.other, whole.unknown, whole.without_pixels) == (0, 0, 0)
 
 
+@pytest.mark.slow
+def test_small_circles_that_move_fast_have_the_same_bits(tmp_path: Path) -> None:
+    """Their windows are larger than their regions."""
+    (path,) = record(tmp_path, "fill = 0.15\n[table.motion]\namplitude_mm = 30\nfrequency_hz = 4")
+    account = reprocess(path, out=tmp_path / "again.mcap", jobs=1)
+    assert (account.other, account.without_pixels) == (0, 0)
+    assert account.same > 400
+
+
+@pytest.mark.slow
+def test_a_marker_that_was_covered_and_searched_again_has_the_same_bits(tmp_path: Path) -> None:
+    """The table carries the marker out of the picture and back."""
+    (path,) = record(tmp_path, "[table.motion]\namplitude_mm = 300\nfrequency_hz = 0.3")
+    found = read(path).samples
+    assert not found["valid"].iloc[-200:].all()
+    account = reprocess(path, out=tmp_path / "again.mcap", jobs=1)
+    assert account.other == 0
+    assert account.same > 400
+
+
 def test_the_command_line(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -52,6 +52,29 @@ def regions_around(
     return tuple(regions)
 
 
+def with_read(
+    regions: Sequence[Sequence[Region]], read: Sequence[tuple[int, int, int, int]]
+) -> tuple[tuple[Region, ...], ...]:
+    """Return the regions, each grown over what was read nearest to it, so that measuring finds
+    every pixel again. `read` are left, top, right and bottom, the last two exclusive."""
+    boxes = [
+        [[r.x_px, r.y_px, r.x_px + r.width_px, r.y_px + r.height_px] for r in circles]
+        for circles in regions
+    ]
+    every = [box for circles in boxes for box in circles]
+    middles = [(left + right, top + bottom) for left, top, right, bottom in every]
+    for n, (left, top, right, bottom) in enumerate(read if every else ()):
+        # What was read comes in the order of the circles, and mostly lies in its region.
+        own = every[n % len(every)]
+        if own[0] <= left and own[1] <= top and right <= own[2] and bottom <= own[3]:
+            continue
+        x, y = left + right, top + bottom
+        away = [abs(x - mx) + abs(y - my) for mx, my in middles]
+        box = every[away.index(min(away))]
+        box[:] = min(box[0], left), min(box[1], top), max(box[2], right), max(box[3], bottom)
+    return tuple(tuple(Region(a, b, c - a, d - b) for a, b, c, d in circles) for circles in boxes)
+
+
 def check_regions(regions: Sequence[Region], width_px: int, height_px: int) -> list[str]:
     """Return a sentence for each thing that is wrong with regions set by hand; empty if none."""
     faults = []

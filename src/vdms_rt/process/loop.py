@@ -15,6 +15,7 @@ import numpy as np
 from vdms_rt.command import Applied, Look, Refused, Snapshot
 from vdms_rt.config import Config
 from vdms_rt.measure.gate import Workspace
+from vdms_rt.measure.regions import with_read
 from vdms_rt.model import (
     Displacement,
     Event,
@@ -145,6 +146,7 @@ class Processor:
     def _measure(self, frame: Frame, stop: threading.Event) -> None:
         progress, looks = self._commanded(self._progress_for(frame), frame)
         samples: tuple[Displacement, ...] = ()
+        self._work.read.clear()
         for picture in pictures(frame, self._sampling, progress.order):
             if progress.searched:
                 progress = self._searched(progress, picture, stop)
@@ -160,7 +162,8 @@ class Processor:
                 self._outlet.set_up(progress.set_up, frame.image)
             for event in events:
                 self._outlet.event(_at(event, picture))
-        self._outlet.pixels(frame, progress.regions, progress.revision)
+        seen = with_read(progress.regions, self._work.read)
+        self._outlet.pixels(frame, seen, progress.revision)
         self.counters.state = progress.state
         for look in looks:
             look.set_result(_snapshot(frame, progress, samples))

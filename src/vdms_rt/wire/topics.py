@@ -100,7 +100,7 @@ PICTURE = Topic(
     "vdms/{station}/picture",
     picture_pb2.CompressedImage,
     "",
-    "with each set-up",
+    "with each reference",
     network=False,
     recorded=True,
 )
