@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
+import sys
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -14,7 +17,7 @@ import numpy as np
 from vdms_replay.columns import Clock, Samples
 from vdms_replay.load import NOT_PIXELS, PIXELS, ROWS_AT_ONCE, About, Once, iso, metadata
 from vdms_replay.source import Entry, PathLike, Source, by_station
-from vdms_replay.summary import MarkerSummary
+from vdms_replay.summary import MarkerSummary, known
 from vdms_replay.verb import Verbs, make_parser, progress
 from vdms_rt.measure.homography import scale_px_per_mm
 from vdms_rt.model import VdmsError
@@ -47,9 +50,10 @@ def run(arguments: argparse.Namespace) -> int:
         with progress("reading", source.size_bytes) as advance:
             told.append(survey(source, advance))
     if arguments.json:
-        print(json.dumps(told, indent=1, ensure_ascii=False))
+        print(json.dumps(told, indent=1, ensure_ascii=False, allow_nan=False))
     else:
-        print("\n\n".join(page(one) for one in told))
+        text = "\n\n".join(page(one) for one in told)
+        print(folded(text) if sys.stdout.isatty() else text)
     return 0
 
 
@@ -150,9 +154,9 @@ def _clock(about: About, health: pb.Health | None) -> dict[str, Any]:
         return {}
     return {
         "utc_state": last.utc_state or "unknown",
-        "jitter_us": last.clock_jitter_us,
-        "sigma_us": last.clock_sigma_us,
-        "rate_ppm": last.clock_rate_ppm,
+        "jitter_us": known(last.clock_jitter_us),
+        "sigma_us": known(last.clock_sigma_us),
+        "rate_ppm": known(last.clock_rate_ppm),
     }
 
 
@@ -253,12 +257,7 @@ def _trouble(told: dict[str, Any]) -> list[str]:
     if counters:
         text = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counters.items())
         lines.append(_line("frames", text))
-    if clock := told["clock"]:
-        text = (
-            f"UTC {clock['utc_state']}; stamps jitter by {clock['jitter_us']:.0f} us, frame clock "
-            f"known to {clock['sigma_us']:.0f} us, {clock['rate_ppm']:+.1f} ppm"
-        )
-        lines.append(_line("clock", text))
+    lines.append(_line("clock", _clock_text(told["clock"])))
     severities = Counter(event["severity"] for event in told["events"])
     lines.append(
         _line(
@@ -279,8 +278,29 @@ def _trouble(told: dict[str, Any]) -> list[str]:
     return lines
 
 
+def _clock_text(clock: dict[str, Any]) -> str:
+    if not clock:
+        return "unknown"
+    text = f"UTC {clock['utc_state']}"
+    if None not in clock.values():
+        text += (
+            f"; stamps jitter by {clock['jitter_us']:.0f} us, frame clock known to "
+            f"{clock['sigma_us']:.0f} us, {clock['rate_ppm']:+.1f} ppm"
+        )
+    return text
+
+
 def _each(word: str, sentences: Iterable[str]) -> list[str]:
     return [_line(word, sentence) for sentence in sentences]
+
+
+def folded(text: str) -> str:
+    """Return the page with its long lines folded at the terminal's width, under their texts."""
+    width = max(shutil.get_terminal_size().columns, 40)
+    return "\n".join(
+        textwrap.fill(line, width, subsequent_indent=" " * 12, break_on_hyphens=False)
+        for line in text.splitlines()
+    )
 
 
 def _line(word: str, text: str) -> str:

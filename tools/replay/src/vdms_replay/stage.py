@@ -86,8 +86,8 @@ class Stage:
 
     def say(self, cue: Cue, take: int) -> None:
         """Publish one cue of a take."""
-        value = cue.value
-        if isinstance(value, (pb.Displacement, pb.Health, pb.Event, pb.SetUp)):
+        value: Any = cue.value
+        if "session" in value.DESCRIPTOR.fields_by_name:
             value.session = (value.session ^ take) & SESSION_BITS
         if isinstance(value, pb.Health):
             value.recording = ""

@@ -193,7 +193,7 @@ class MarkerSummary:
             "flagged": dict(self.flagged.most_common()),
             "first_s": self.first_s,
             "last_s": self.last_s,
-            "rate_hz": _known(self.rate_hz),
+            "rate_hz": known(self.rate_hz),
             "lost": self.lost,
             "gap_count": self.gap_count,
             "gaps": [
@@ -208,24 +208,25 @@ class MarkerSummary:
             ],
             "axes": {
                 name: {
-                    "lowest": _known(axis.lowest),
-                    "lowest_at_s": _known(axis.lowest_s),
-                    "highest": _known(axis.highest),
-                    "highest_at_s": _known(axis.highest_s),
+                    "lowest": known(axis.lowest),
+                    "lowest_at_s": known(axis.lowest_s),
+                    "highest": known(axis.highest),
+                    "highest_at_s": known(axis.highest_s),
                     "mean": axis.mean if axis.count else None,
-                    "deviation": _known(axis.deviation),
+                    "deviation": known(axis.deviation),
                 }
                 for name, axis in self.axes.items()
             },
-            "sigma_x_mm": _known(self.sigma_x_mm),
-            "sigma_y_mm": _known(self.sigma_y_mm),
+            "sigma_x_mm": known(self.sigma_x_mm),
+            "sigma_y_mm": known(self.sigma_y_mm),
             "quietest_second": {
-                "x_mm": _known(self.quiet.x_mm),
-                "y_mm": _known(self.quiet.y_mm),
-                "at_s": _known(self.quiet.time_s),
+                "x_mm": known(self.quiet.x_mm),
+                "y_mm": known(self.quiet.y_mm),
+                "at_s": known(self.quiet.time_s),
             },
         }
 
 
-def _known(value: float) -> float | None:
+def known(value: float) -> float | None:
+    """Return the value, None for NaN and infinity, which JSON does not have."""
     return value if math.isfinite(value) else None
