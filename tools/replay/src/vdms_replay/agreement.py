@@ -191,7 +191,7 @@ def _lines(
         around = slice(max(k - 2, 1), k + 3)
         power = float(rr[around].sum()) * step_hz
         ratio = complex(rc[k] / rr[k])
-        frequency_hz = _summit(f, rr, k)
+        frequency_hz = summit(f, rr, k)
         phase_deg = math.degrees(math.atan2(ratio.imag, ratio.real))
         lines.append(
             Line(
@@ -209,7 +209,7 @@ def _lines(
     return tuple(sorted(strong[:LINES], key=lambda line: line.frequency_hz))
 
 
-def _summit(f: Floats, density: Floats, k: int) -> float:
+def summit(f: Floats, density: Floats, k: int) -> float:
     """Return where the parabola through three values of the logarithm is highest."""
     if not 0 < k < len(f) - 1 or density[k - 1 : k + 2].min() <= 0:
         return float(f[k])

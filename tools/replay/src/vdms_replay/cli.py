@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 import vdms_replay
-from vdms_replay import compare, derive, export, info, play, recover, reprocess
+from vdms_replay import compare, derive, export, info, play, recover, report, reprocess
 from vdms_rt.model import VdmsError
 
 EXIT_DONE = 0
@@ -24,6 +24,7 @@ VERBS = (
     export,
     derive,
     compare,
+    report,
 )
 
 

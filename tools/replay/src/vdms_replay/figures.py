@@ -121,10 +121,10 @@ def figure_of_comparison(one: Comparison) -> Figure:
         _legend_above(both, 2)
         both.set_title(f"{one.path.stem}, marker {one.chosen.marker}")
         curve(rest, g.time_s, 1000 * g.difference_mm, ORANGE)
-        rest.set_ylabel("camera - reference, µm")
+        rest.set_ylabel("difference, µm")
         rest.set_xlabel("time since the first sample, s")
         rest.set_title(
-            f"Difference: {1000 * g.rmse_mm:.2f} µm RMS, Eq. 3.1: {g.error_percent:.4f} %"
+            f"Camera - reference: {1000 * g.rmse_mm:.2f} µm RMS, Eq. 3.1: {g.error_percent:.4f} %"
         )
         rest.sharex(both)
         if one.spectrum is not None:
