@@ -13,6 +13,7 @@ import vdms_replay
 from vdms_replay.cli import run
 from vdms_replay.info import info
 from vdms_replay.summary import Axis
+from vdms_rt.logfile.reader import LogReader
 from vdms_rt.wire import vdms_pb2 as pb
 
 GAP = range(100, 105)
@@ -131,8 +132,10 @@ def test_an_unfinished_file_is_read_told_and_completed(tmp_path, capsys):
 
 def test_a_damaged_file_stays_and_its_readable_part_is_written_beside_it(tmp_path, capsys):
     path = write_recording(tmp_path / "a.mcap", range(300))
+    with LogReader(path) as reader:
+        chunk = [block for block in reader.blocks() if block.chunk is not None][4]
     data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0xFF
+    data[chunk.offset + len(chunk.content) // 2] ^= 0xFF
     path.write_bytes(data)
     assert run(["recover", str(path)]) == 0
     assert "unreadable bytes left out" in capsys.readouterr().out
