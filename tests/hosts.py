@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+
+DEADLINE_S = 60.0
 
 needs_root = pytest.mark.skipif(
     os.geteuid() != 0 or shutil.which("ip") is None,
@@ -87,6 +90,34 @@ def two_hosts() -> Iterator[Hosts]:
             for device in ("lo", host.device):
                 _ip("-n", host.name, "link", "set", device, "up")
         yield Hosts(station, laptop)
+
+
+@contextlib.contextmanager
+def running(host: Host, folder: Path, sections: str) -> Iterator[Path]:
+    """A whole station on a host; gives the folder of its recordings, whole after it has ended."""
+    config = folder / "vdms.toml"
+    config.write_text(f"""
+source = "table"
+station.name = "lab"
+setup.directory = "{folder}"
+[table.motion]
+kind = "still"
+[record]
+directory = "{folder / "recordings"}"
+{sections}
+""")
+    with (folder / "log").open("w") as log:
+        station = host.start("-m", "vdms_rt", "run", "--config", config, stderr=log)
+        try:
+            until_s = time.monotonic() + DEADLINE_S
+            while "reference taken" not in (folder / "log").read_text():
+                assert time.monotonic() < until_s, (folder / "log").read_text()
+                assert station.poll() is None, (folder / "log").read_text()
+                time.sleep(0.05)
+            yield folder / "recordings"
+        finally:
+            station.terminate()
+            station.wait(DEADLINE_S)
 
 
 def _ip(*arguments: str) -> None:

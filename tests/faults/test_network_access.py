@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hosts import Host, Hosts, needs_root, two_hosts
+from hosts import Host, Hosts, needs_root, running, two_hosts
 
 from vdms_rt import keys
 
@@ -57,34 +55,6 @@ def secrets(tmp_path_factory: pytest.TempPathFactory, hosts: Hosts) -> Path:
         keys.make_client(folder / name, "ann")
     keys.make_password(folder / "keys", "bob", "swordfish")
     return folder
-
-
-@contextlib.contextmanager
-def running(host: Host, folder: Path, sections: str) -> Iterator[Path]:
-    """A whole station on a host; gives the folder of its recordings, whole after it has ended."""
-    config = folder / "vdms.toml"
-    config.write_text(f"""
-source = "table"
-station.name = "lab"
-setup.directory = "{folder}"
-[table.motion]
-kind = "still"
-[record]
-directory = "{folder / "recordings"}"
-{sections}
-""")
-    with (folder / "log").open("w") as log:
-        station = host.start("-m", "vdms_rt", "run", "--config", config, stderr=log)
-        try:
-            until_s = time.monotonic() + DEADLINE_S
-            while "reference taken" not in (folder / "log").read_text():
-                assert time.monotonic() < until_s, (folder / "log").read_text()
-                assert station.poll() is None, (folder / "log").read_text()
-                time.sleep(0.05)
-            yield folder / "recordings"
-        finally:
-            station.terminate()
-            station.wait(DEADLINE_S)
 
 
 @pytest.fixture(scope="module")

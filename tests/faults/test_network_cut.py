@@ -7,10 +7,14 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
-from hosts import ROOT, Host, Hosts, needs_root, two_hosts
+from hosts import ROOT, Host, Hosts, needs_root, running, two_hosts
 from reading import Reader
+
+from vdms_rt.logfile.reader import LogReader, StoredMessage
+from vdms_rt.wire import vdms_pb2 as pb
 
 pytestmark = [needs_root, pytest.mark.slow]
 
@@ -147,4 +151,38 @@ def test_a_stopped_reader_holds_up_nobody_else(hosts: Hosts) -> None:
         seen = [listening.end() for listening in (stopped, other)]
     for one in seen:
         assert one.samples == {7: list(range(len(one.samples[7])))}
+        assert one.missed == []
+
+
+@pytest.mark.timeout(300)
+def test_a_stopped_reader_costs_a_whole_station_nothing(hosts: Hosts, tmp_path: Path) -> None:
+    with (
+        running(hosts.station, tmp_path, "") as recordings,
+        reader(hosts) as stopped,
+        reader(hosts) as other,
+    ):
+        while not other.seen.samples or not stopped.seen.samples:
+            time.sleep(0.01)
+        ((session, _),) = other.seen.samples.items()
+        for listening in (stopped, other):
+            listening.wait(session, 60)
+        stopped.process.send_signal(signal.SIGSTOP)
+        other.wait(session, other.newest(session) + 600)
+        stopped.process.send_signal(signal.SIGCONT)
+        stopped.wait(session, other.newest(session))
+        seen = [listening.end() for listening in (stopped, other)]
+    with LogReader(next(recordings.iterdir())) as log:
+        stored = [r for r in log if isinstance(r, StoredMessage)]
+    recorded = [
+        pb.Displacement.FromString(m.message.data).seq
+        for m in stored
+        if m.channel.topic.endswith("/displacement")
+    ]
+    ends = [pb.End.FromString(m.message.data) for m in stored if m.channel.topic.endswith("/end")]
+    (end,) = ends
+    assert (end.health.overwritten, end.health.not_recorded, end.health.unsent) == (0, 0, 0)
+    assert recorded == list(range(recorded[0], recorded[-1] + 1))
+    for one in seen:
+        got = one.samples[session]
+        assert got == recorded[: len(got)]
         assert one.missed == []
