@@ -32,6 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -83,9 +84,11 @@ def table_of(results: Sequence[Result]) -> Table:
     """Return one line for each setting, over all distances and angles: the worst error beside its
     bound, the median and the worst of the ratio. `loss` is what the exposure takes off the
     amplitude."""
-    table = Table(title="Eq. 3.1 in %, over all distances and angles; std of x over its bound")
+    table = Table(
+        title="Eq. 3.1 in %, over all distances and angles; std of x over its bound", box=box.SIMPLE
+    )
     for name in ("set", "method", "sampling"):
-        table.add_column(name)
+        table.add_column(name, no_wrap=True)
     names = ("f Hz", "A mm", "v mm/s", "exp ms", "loss %", "noise", "cases", "worst %", "bound %")
     for name in (*names, "median", "worst", "in 2 sigma", "flagged %", "lost %"):
         table.add_column(name, justify="right")
@@ -171,7 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         seed=options.seed,
     )
     settings = [s for name in wanted if name in SETS for s in SETS[name](choice)]
-    console = Console(width=150, file=sys.stdout)
+    console = Console(width=165, file=sys.stdout)
     if settings:
         results = measured(settings, options.jobs)
         if options.csv:

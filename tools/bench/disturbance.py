@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from rich import box
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -183,7 +184,8 @@ def measured(samplings: Sequence[str], count: int, seed: int, jobs: int) -> list
 def table_of(rows: Sequence[Row]) -> Table:
     table = Table(
         title=f"One disc hit: {BENCH.distance_m:g} m, {BENCH.angle_deg:g} deg, "
-        f"{AMPLITUDE_MM:g} mm at 1 Hz, noise {NOISE_GREY:g}"
+        f"{AMPLITUDE_MM:g} mm at 1 Hz, noise {NOISE_GREY:g}",
+        box=box.SIMPLE,
     )
     names = ("sampling", "samples", "rms x um", "rms y um", "worst um", "lost %", "flagged %")
     for name in ("disturbance", *names, "all used %", "> 4 sigma", "silent", "in 2 sigma"):
