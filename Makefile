@@ -52,7 +52,7 @@ test: check ## everything that runs without a kernel of its own
 quick: $(VENV)/replay.stamp ## the fast tests alone
 	@$(BIN)/pytest -q -m "not rig and not slow and not soak"
 
-soak: $(VENV)/dev.stamp ## the long tests: faults many times over (as root, or some are skipped)
+soak: $(VENV)/replay.stamp ## the long tests: faults many times over (as root, or some are skipped)
 	@$(BIN)/pytest -m "soak and not rig"
 
 rig: $(VENV)/dev.stamp ## the tests on real kernel drivers, in a virtual machine (DEVICE=...: on that grabber)
