@@ -18,10 +18,16 @@ from vdms_rt.model import VdmsError
 from vdms_rt.wire.access import BY_CERTIFICATE, EVERYONE, THIS_COMPUTER, access
 from vdms_rt.wire.keys import KeysError, server_tls
 from vdms_rt.wire.session import SESSION, endpoint_fault, reason
-from vdms_rt.wire.topics import ALIVE_KEY, TOPICS, Topic
+from vdms_rt.wire.topics import ALIVE_KEY, TOPICS, Priority, Recovery, Topic
 
 HEARTBEAT_S = 0.5
 """How often a subscriber learns the newest number, so that it misses even the last sample."""
+
+
+PRIORITIES = {
+    Priority.HIGH: zenoh.Priority.DATA_HIGH,
+    Priority.NORMAL: zenoh.Priority.DATA,
+}
 
 
 class PublishError(VdmsError):
@@ -201,8 +207,8 @@ class Publisher:
     def _declare(self, topic: Topic, key: str) -> zenoh.Publisher | ext.AdvancedPublisher:
         assert self._session is not None
         encoding = f"application/protobuf;{topic.message.DESCRIPTOR.full_name}"
-        priority = zenoh.Priority.DATA_HIGH if topic.urgent else zenoh.Priority.DATA
-        if not (topic.recovered or topic.latest):
+        priority = PRIORITIES[topic.priority]
+        if topic.recovery is Recovery.NONE:
             return self._session.declare_publisher(
                 key,
                 encoding=encoding,
@@ -218,13 +224,13 @@ class Publisher:
             # While it replays, the history is locked against `put`: a reader that stops in the
             # middle may therefore lose some of it, but not stop the station.
             cache=ext.CacheConfig(
-                max_samples=self._history if topic.recovered else 1,
+                max_samples=self._history if topic.recovery is Recovery.ALL else 1,
                 replies_config=ext.RepliesConfig(congestion_control=zenoh.CongestionControl.DROP),
             ),
             publisher_detection=True,
             sample_miss_detection=(
                 ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
-                if topic.recovered
+                if topic.recovery is Recovery.ALL
                 else None
             ),
         )

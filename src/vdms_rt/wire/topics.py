@@ -3,11 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 from google.protobuf.message import Message
 
 from vdms_rt.wire import picture_pb2
 from vdms_rt.wire import vdms_pb2 as pb
+
+
+class Recovery(Enum):
+    """What a subscriber gets of what was said while it was not there."""
+
+    NONE = "none"
+    LATEST = "the last message"
+    ALL = "every message of the last publish.recover_s; gaps are found and filled"
+
+
+class Priority(Enum):
+    """What goes first when a link is narrow."""
+
+    HIGH = "high"
+    NORMAL = "normal"
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,12 +36,8 @@ class Topic:
     rate: str
     network: bool
     recorded: bool
-    recovered: bool = False
-    """Kept for subscribers whose link was down, and gaps are found and filled."""
-    urgent: bool = False
-    """Goes before the rest when the link is narrow."""
-    latest: bool = False
-    """A subscriber that comes late gets the last one."""
+    recovery: Recovery = Recovery.NONE
+    priority: Priority = Priority.NORMAL
 
 
 DISPLACEMENT = Topic(
@@ -36,8 +48,8 @@ DISPLACEMENT = Topic(
     "each picture",
     network=True,
     recorded=True,
-    recovered=True,
-    urgent=True,
+    recovery=Recovery.ALL,
+    priority=Priority.HIGH,
 )
 TRUTH = Topic(
     "truth",
@@ -56,7 +68,7 @@ HEALTH = Topic(
     "1 Hz",
     network=True,
     recorded=True,
-    latest=True,
+    recovery=Recovery.LATEST,
 )
 EVENT = Topic(
     "event",
@@ -66,7 +78,7 @@ EVENT = Topic(
     "on change",
     network=True,
     recorded=True,
-    recovered=True,
+    recovery=Recovery.ALL,
 )
 SETUP = Topic(
     "setup",
@@ -76,8 +88,7 @@ SETUP = Topic(
     "on change",
     network=True,
     recorded=True,
-    recovered=True,
-    latest=True,
+    recovery=Recovery.ALL,
 )
 RUN = Topic(
     "run", "vdms/{station}/run", pb.Run, "", "start of each file", network=False, recorded=True
