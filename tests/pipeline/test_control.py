@@ -226,7 +226,7 @@ def test_every_command_is_an_event_with_who_what_and_when(
 ) -> None:
     before_ns = time.time_ns()
     applied = ask.ask("axis", axis_deg=12.5)
-    ask.ask("axis", axis_deg=900.0)
+    ask.ask("axis", axis_deg=900.0, who="bob\n@ the page")
     ask.ask("axis", axis_deg=-7.25)
     done, no, _ = [e for e in commands(station, "along -7.25 deg") if e.utc_ns > before_ns]
     assert ask.ask("axis", axis_deg=0.0).done
@@ -239,6 +239,7 @@ def test_every_command_is_an_event_with_who_what_and_when(
     assert facts["request"] == "axis_deg: 12.5"
     assert int(facts["seq"]) == applied.seq
     assert dict(no.facts)["code"] == "bounds"
+    assert dict(no.facts)["who"] == "bob @ the page"
     assert before_ns < done.utc_ns < time.time_ns()
 
 

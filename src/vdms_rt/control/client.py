@@ -94,13 +94,16 @@ class Controller:
     ) -> None:
         self._open.close()
 
-    def ask(self, verb: str, *, timeout_s: float = ANSWER_S, **fields: Any) -> control.Answer:
+    def ask(
+        self, verb: str, *, timeout_s: float = ANSWER_S, who: str = "", **fields: Any
+    ) -> control.Answer:
         """Send a request, `fields` of its message in control.proto, and return the answer.
 
+        `who` is said in the station's log instead of the controller's own.
         An answer that is not `done` was refused; its text says why. Raises ControlError if none
         came, and ValueError or TypeError for fields that the verb does not have.
         """
-        request = VERBS[verb](who=self._who, **fields)
+        request = VERBS[verb](who=who or self._who, **fields)
         station = self._one_station()
         key = CONTROL_KEY.format(station=station, verb=verb)
         answers = list(self._get(key, request.SerializeToString(), timeout_s))
