@@ -14,6 +14,7 @@ from vdms_replay.cli import run
 from vdms_replay.info import info
 from vdms_replay.summary import Axis
 from vdms_rt.logfile.reader import LogReader
+from vdms_rt.logfile.writer import LogWriter
 from vdms_rt.wire import vdms_pb2 as pb
 
 GAP = range(100, 105)
@@ -152,6 +153,13 @@ def test_recover_into_a_named_file_leaves_the_unfinished_one(tmp_path):
     assert run(["recover", str(part), "--out", str(tmp_path / "b.mcap")]) == 0
     assert part.read_bytes() == before
     assert read_whole(tmp_path / "b.mcap")
+
+
+def test_what_is_being_recorded_is_not_recovered(tmp_path, capsys):
+    log = LogWriter(tmp_path / "a.mcap")
+    assert run(["recover", str(log.part_path)]) == 1
+    assert "is being recorded right now" in capsys.readouterr().err
+    log.abandon()
 
 
 def test_bad_input_is_one_sentence_and_a_status(tmp_path, capsys):

@@ -55,6 +55,7 @@ def test_metadata_travels_in_the_attributes_and_is_plain(tmp_path):
     assert attrs["recorded_by"] == "vdms-rt 9.9"
     assert attrs["device"] == {"source": "written by a test"}
     assert attrs["ends"] == ["stopped by the test"]
+    assert attrs["events"] == ["2026-09-21T14:13:20.273606939Z warning: a frame was missed"]
     assert attrs["units"]["x_mm"] == "mm"
     assert attrs["recorded_at"].startswith("2026-")
 

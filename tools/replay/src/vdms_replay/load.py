@@ -18,6 +18,8 @@ from vdms_rt.setup import SetUp, set_up_from_json
 from vdms_rt.wire import vdms_pb2 as pb
 
 ROWS_AT_ONCE = 16384
+EVENTS_TOLD = 1000
+"""In the metadata; `Recording.about.events` has all."""
 PIXELS = "vdms.Pixels"
 
 
@@ -270,6 +272,7 @@ def metadata(about: About, paths: Sequence[Path], damage: Sequence[Damage]) -> d
         "set_up_json": [s.json for s in about.set_ups.values()],
         "config_text": run.config_text,
         "config_json": run.effective_config,
+        "events": [_event_line(event) for event in about.events[:EVENTS_TOLD]],
         "ends": [end.reason for end in about.ends],
         "not_readable": [sentence for one in damage for sentence in one.sentences()],
         "repairs": list(about.repairs),
@@ -284,6 +287,11 @@ def iso(utc_ns: int) -> str:
         return ""
     seconds, rest_ns = divmod(utc_ns, 1_000_000_000)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns:09}Z"
+
+
+def _event_line(event: pb.Event) -> str:
+    severity = pb.Event.Severity.Name(event.severity).lower() if event.severity < 3 else "event"
+    return f"{iso(event.utc_ns)} {severity}: {event.text}"
 
 
 HEALTH_FIELDS = [field.name for field in pb.Health.DESCRIPTOR.fields]

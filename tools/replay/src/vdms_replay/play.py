@@ -16,6 +16,9 @@ from vdms_replay.verb import Verbs, make_parser, number, progress
 from vdms_rt.config import Publish
 from vdms_rt.wire.session import DEFAULT_ENDPOINT
 
+HISTORY_S = 60.0
+"""Of the recording, for receivers that come late: as much as a station keeps."""
+
 
 def add_parser(verbs: Verbs) -> None:
     parser = make_parser(
@@ -91,11 +94,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _network(arguments: argparse.Namespace) -> Publish:
+    recover_s = min(max(HISTORY_S / arguments.speed, 1.0), 600.0)
     if arguments.connect:
         if arguments.listen:
             raise ReplayError("--listen and --connect exclude each other; give one of them")
-        return Publish(mode="client", connect=tuple(arguments.connect))
-    return Publish(listen=tuple(arguments.listen or (DEFAULT_ENDPOINT,)))
+        return Publish(mode="client", connect=tuple(arguments.connect), recover_s=recover_s)
+    return Publish(listen=tuple(arguments.listen or (DEFAULT_ENDPOINT,)), recover_s=recover_s)
 
 
 def moment(text: str | None, option: str, programme: Programme, otherwise_ns: int) -> int:
