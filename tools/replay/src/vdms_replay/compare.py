@@ -133,7 +133,7 @@ def hints(one: Comparison) -> list[str]:
             "zero is another"
         )
     if one.spectrum is None:
-        told.append("too few samples in a row for frequencies")
+        told.append("too few samples for frequencies, or too many are missing")
     elif one.spectrum.filled:
         told.append(f"{one.spectrum.filled} missing samples are interpolated for the frequencies")
     return told

@@ -101,6 +101,15 @@ def curve(axes: Axes, t: Floats, y: Floats, colour: str, label: str | None = Non
     )
 
 
+def with_gaps(time_s: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Return times with one more in each gap, and where it was put in."""
+    steps = np.diff(time_s)
+    if not len(steps):
+        return time_s, np.zeros(0, np.int64)
+    gaps = np.flatnonzero(steps > 1.5 * np.median(steps)).astype(np.int64) + 1
+    return np.insert(time_s, gaps, time_s[gaps - 1]), gaps
+
+
 def density(axes: Axes, f: Floats, values: Floats, colour: str, label: str, **how: Any) -> None:
     """Draw the square root of a spectral density, without its value at 0 Hz."""
     axes.loglog(f[1:], np.sqrt(np.maximum(values[1:], 1e-30)), color=colour, label=label, **how)
@@ -114,13 +123,19 @@ def figure_of_comparison(one: Comparison) -> Figure:
         rows = [2.0, 1.4, 2.0, 1.0] if one.spectrum is not None else [2.0, 1.4]
         panels: Any = figure.subplots(len(rows), 1, height_ratios=rows)
         both, rest = panels[:2]
-        curve(both, g.time_s, g.reference_mm, GREY, "reference, as the camera would see it",
-              linewidth=2.2)  # fmt: skip
-        curve(both, g.time_s, g.camera_mm, BLUE, "camera")
+        at_s, gaps = with_gaps(g.time_s)
+        reference_mm, camera_mm, difference_um = (
+            np.insert(values, gaps, np.nan)
+            for values in (g.reference_mm, g.camera_mm, 1000 * g.difference_mm)
+        )
+        curve(
+            both, at_s, reference_mm, GREY, "reference, as the camera would see it", linewidth=2.2
+        )
+        curve(both, at_s, camera_mm, BLUE, "camera")
         both.set_ylabel("displacement, mm")
         _legend_above(both, 2)
         both.set_title(f"{one.path.stem}, marker {one.chosen.marker}")
-        curve(rest, g.time_s, 1000 * g.difference_mm, ORANGE)
+        curve(rest, at_s, difference_um, ORANGE)
         rest.set_ylabel("difference, µm")
         rest.set_xlabel("time since the first sample, s")
         rest.set_title(

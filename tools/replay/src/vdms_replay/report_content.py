@@ -205,7 +205,7 @@ def _peaks(summary: MarkerSummary) -> list[tuple[str, ...]]:
 
 def _about_lines(lines: Lines | None) -> str:
     if lines is None:
-        return "Too few samples in a row for a spectrum."
+        return "Too few samples for a spectrum, or too many are missing."
     text = (
         f"Spectrum: mean over Hann windows, resolution {lines.resolution_hz:.3g} Hz; the height of "
         "a peak is the amplitude of a steady sine."
@@ -347,14 +347,21 @@ def _set_up_text(recording: Recording, chosen: Chosen) -> list[Block]:
 
 def _happened(recording: Recording) -> list[Block]:
     events = [e for e in recording.about.events if e.severity != pb.Event.INFO]
-    ends = [Facts([("End", end.reason) for end in recording.about.ends])]
+    ends: list[Block] = [Facts([("End", end.reason) for end in recording.about.ends])]
+    if not recording.about.ends:
+        ends = [Words("The recording has no end: it was cut off.")]
     if not events:
         return [Heading("Events"), Words("No warning and no error."), *ends]
-    rows = [(_time(e.utc_ns) or "-", e.text) for e in events[:EVENTS_TOLD]]
-    blocks: list[Block] = [Heading("Warnings and errors"), Facts(rows)]
-    if len(events) > EVENTS_TOLD:
-        blocks.append(Words(f"{len(events) - EVENTS_TOLD} more are in the recording."))
-    return [*blocks, *ends]
+    alike: dict[str, list[pb.Event]] = {}
+    for event in events:
+        alike.setdefault(event.code, []).append(event)
+    rows = []
+    for same in list(alike.values())[:EVENTS_TOLD]:
+        text = same[0].text
+        if len(same) > 1:
+            text += f" (and {len(same) - 1} more of the kind, the last at {_time(same[-1].utc_ns)})"
+        rows.append((_time(same[0].utc_ns) or "at a time not known", text))
+    return [Heading("Warnings and errors"), Facts(rows), *ends]
 
 
 def _time(utc_ns: int) -> str:

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 from scipy import signal
 
 from vdms_replay.agreement import summit
@@ -26,6 +25,7 @@ from vdms_replay.figures import (
     curve,
     new_figure,
     styled,
+    with_gaps,
 )
 from vdms_rt.measure.homography import to_image_px
 from vdms_rt.setup import SetUp
@@ -110,7 +110,7 @@ def figure_of_history(chosen: Chosen) -> Figure:
     table = chosen.table
     time_s = table["time_s"].to_numpy(np.float64)
     valid = table["valid"].to_numpy(bool)
-    at_s, gaps = _with_gaps(time_s)
+    at_s, gaps = with_gaps(time_s)
     with styled():
         figure = new_figure(4.3)
         panels: Any = figure.subplots(3, 1, sharex=True, height_ratios=[2, 1.4, 1.1])
@@ -169,7 +169,7 @@ def figure_of_quality(chosen: Chosen) -> Figure:
     """Return the stated standard deviations and the circles' misfit over time."""
     valid = chosen.valid
     time_s = valid["time_s"].to_numpy(np.float64)
-    at_s, gaps = _with_gaps(time_s)
+    at_s, gaps = with_gaps(time_s)
     with styled():
         figure = new_figure(2.5)
         axes: Any = figure.subplots()
@@ -203,7 +203,7 @@ def figure_of_set_up(picture: bytes | None, set_up: SetUp, pixel_aspect: float) 
         axes.grid(visible=False)
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)
         if image is not None:
-            axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=extent)
+            axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="none")
         axes.set_xlim(extent[:2])
         axes.set_ylim(extent[2:])
         axes.set_aspect(pixel_aspect)
@@ -231,6 +231,7 @@ def figure_of_set_up(picture: bytes | None, set_up: SetUp, pixel_aspect: float) 
                 ha="center",
                 va="bottom",
                 fontweight="bold",
+                bbox={"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.2},
             )
         axes.set_xlabel("column, px")
         axes.set_ylabel("row, px")
@@ -255,15 +256,6 @@ def _draw_axes(axes: Any, homography: Floats) -> None:
             color="#37b24d",
             fontweight="bold",
         )
-
-
-def _with_gaps(time_s: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Return times with one more in each gap, and where it was put in."""
-    steps = np.diff(time_s)
-    if not len(steps):
-        return time_s, np.zeros(0, np.int64)
-    gaps = np.flatnonzero(steps > 1.5 * np.median(steps)).astype(np.int64) + 1
-    return np.insert(time_s, gaps, time_s[gaps - 1]), gaps
 
 
 def _stretches(time_s: Floats, on: Any) -> Sequence[tuple[float, float]]:

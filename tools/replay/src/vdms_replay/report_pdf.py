@@ -82,8 +82,13 @@ def write_pdf(report: Report, path: Path) -> None:
         if isinstance(block, Heading) or (held and leads):
             held += made_of
             continue
-        # A heading stays with what it heads.
-        story += [KeepTogether([*held, *made_of[:1]]), *made_of[1:]] if held else made_of
+        if isinstance(block, Drawing):
+            story.append(KeepTogether([*held, *made_of]))
+        elif held:
+            # A heading stays with what it heads.
+            story += [KeepTogether([*held, *made_of[:1]]), *made_of[1:]]
+        else:
+            story += made_of
         held = []
     pages = io.BytesIO()
     document = BaseDocTemplate(
@@ -124,9 +129,8 @@ def _flowables(
         case Drawing(figure, caption):
             figures.append(figure)
             place = _Place(len(figures) - 1, figure, places)
-            if not caption:
-                return [place, Spacer(1, 2 * mm)]
-            return [KeepTogether([place, Paragraph(escape(caption), styles["caption"])])]
+            told = Paragraph(escape(caption), styles["caption"]) if caption else Spacer(1, 2 * mm)
+            return [place, told]
 
 
 def _facts(rows: Sequence[tuple[str, str]], styles: dict[str, ParagraphStyle]) -> Any:
