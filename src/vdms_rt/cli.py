@@ -7,6 +7,7 @@ import faulthandler
 import getpass
 import logging
 import math
+import secrets
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -217,6 +218,8 @@ def _parser() -> argparse.ArgumentParser:
         "--seconds", type=_seconds, default=0.0, metavar="N", help="end after N seconds"
     )
 
+    _add_view(verbs)
+
     verb = _verb(
         verbs,
         "ctl",
@@ -256,6 +259,49 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_view(verbs: Any) -> None:
+    verb = _verb(
+        verbs,
+        "view",
+        _view,
+        "serve a page to look at stations, set them up and start runs",
+        "Connect to one or several stations, here or on other computers, and serve a page for the "
+        "browser, by default to this computer alone. With --host 0.0.0.0 the whole network may "
+        "look, at the camera's picture too; with --token who has it may also control. "
+        "Ctrl-C ends it.",
+    )
+    verb.add_argument(
+        "--connect",
+        action="append",
+        metavar="ADDRESS",
+        help=f"where a station listens, may be given again (default: {ctl.DEFAULT_ADDRESS})",
+    )
+    verb.add_argument(
+        "--control",
+        action="append",
+        metavar="ADDRESS",
+        help="where it takes requests, if that is another address",
+    )
+    verb.add_argument(
+        "--host", default="127.0.0.1", metavar="ADDRESS", help="to serve at (default: 127.0.0.1)"
+    )
+    verb.add_argument(
+        "--port", type=_port, default=8080, metavar="N", help="to serve at (default: 8080)"
+    )
+    verb.add_argument(
+        "--token",
+        nargs="?",
+        const=True,
+        default="",
+        metavar="TEXT",
+        help="what a browser needs to control; without TEXT one is made up and printed",
+    )
+    ctl.add_credentials(verb)
+    verb.add_argument(
+        "--seconds", type=_seconds, default=0.0, metavar="N", help="end after N seconds"
+    )
+
+
 def _verb(
     verbs: Any, name: str, body: Callable[[argparse.Namespace], int], short: str, long: str
 ) -> argparse.ArgumentParser:
@@ -268,6 +314,12 @@ def _verb(
 
 def _seconds(text: str) -> float:
     return _number(text, 0.0, 1e9, "seconds, 0 or more")
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port: 0 (any free one) to 65535")
+    return int(text)
 
 
 def _millimetres(text: str) -> float:
@@ -389,4 +441,20 @@ def _watch(arguments: argparse.Namespace) -> int:
 
     return run_watch(
         arguments.connect or ctl.DEFAULT_ADDRESS, arguments.csv, seconds=arguments.seconds
+    )
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    from vdms_rt.view import run_view
+
+    connect = arguments.connect or [ctl.DEFAULT_ADDRESS]
+    token = secrets.token_urlsafe(12) if arguments.token is True else arguments.token
+    return run_view(
+        connect,
+        arguments.control or connect,
+        host=arguments.host,
+        port=arguments.port,
+        token=token,
+        credentials=ctl.credentials(arguments),
+        seconds=arguments.seconds,
     )

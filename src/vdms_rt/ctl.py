@@ -38,16 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"where the station listens (default: {DEFAULT_ADDRESS})",
     )
     parser.add_argument("--station", metavar="NAME", help="where several answer at the address")
-    parser.add_argument(
-        "--keys",
-        type=Path,
-        metavar="FOLDER",
-        help="that `vdms-rt keys client` made, for a tls address",
-    )
-    parser.add_argument("--user", metavar="NAME", help="for a station that asks for a password")
-    parser.add_argument(
-        "--password-file", type=Path, metavar="FILE", help="instead of asking for the password"
-    )
+    add_credentials(parser)
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
     verbs = parser.add_subparsers(metavar="REQUEST", required=True)
 
@@ -60,6 +51,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     _add_questions(add)
     _add_commands(add)
+
+
+def add_credentials(parser: argparse.ArgumentParser) -> None:
+    """Add what a station on another computer asks for; `credentials` reads it."""
+    parser.add_argument(
+        "--keys",
+        type=Path,
+        metavar="FOLDER",
+        help="that `vdms-rt keys client` made, for a tls address",
+    )
+    parser.add_argument("--user", metavar="NAME", help="for a station that asks for a password")
+    parser.add_argument(
+        "--password-file", type=Path, metavar="FILE", help="instead of asking for the password"
+    )
 
 
 def _add_questions(add: Add) -> None:
@@ -142,7 +147,7 @@ def run_ctl(arguments: argparse.Namespace) -> int:
     from vdms_rt.control.client import Controller
 
     with Controller(
-        arguments.connect, station=arguments.station, credentials=_credentials(arguments)
+        arguments.connect, station=arguments.station, credentials=credentials(arguments)
     ) as station:
         answer = station.ask(arguments.request, **arguments.fields(arguments))
     if not answer.done:
@@ -207,7 +212,8 @@ def _recordings_text(recordings: control.Recordings) -> str:
     return "\n".join([*lines, free])
 
 
-def _credentials(arguments: argparse.Namespace) -> Credentials:
+def credentials(arguments: argparse.Namespace) -> Credentials:
+    """Return what `add_credentials` reads, asking for a password. Raises CtlError."""
     from vdms_rt.control.client import Credentials
 
     password = ""
