@@ -30,8 +30,10 @@ LEVELS = {
 
 TOLD_OF_A_CODE = 3
 TELL_S = 10.0
-"""In so long, of the events of one code the first few are told one by one, the rest in one line: a
-bad cable may lose frames many times a second, which the recording has one by one."""
+"""After so long, the events of one code beyond the first few are told in one line, and as long as
+they go on in one line for twice as long each time: a bad cable may lose frames many times a second,
+for hours. The recording has them one by one."""
+TELL_LONGEST_S = 600.0
 RECENT = 3600
 """Samples of each marker that are kept for questions about the last minute."""
 
@@ -41,6 +43,7 @@ class _Telling:
     """What was said to the console of one code lately."""
 
     since_s: float
+    lasts_s: float = TELL_S
     told: int = 0
     held: int = 0
     """Events not told yet."""
@@ -124,7 +127,7 @@ class Outlet:
     def tell(self, *, at_end: bool = False) -> None:
         """Write what happened since the last call to the console, which may make its writer wait;
         so no stage does it, but the supervisor. Every change of state; of many other events of
-        one code the first few, and after TELL_S, or `at_end`, how many more, with the newest."""
+        one code the first few, and from time to time, or `at_end`, how many more."""
         now_s = time.monotonic()
         while self._untold:
             event = self._untold.popleft()
@@ -138,21 +141,24 @@ class Outlet:
             if event.code == "reference" and self.newest_set_up is not None:
                 self._tell_set_up(self.newest_set_up)
         for code, telling in list(self._tellings.items()):
-            if at_end or now_s - telling.since_s >= TELL_S:
-                del self._tellings[code]
-                self._tell_held(code, telling, now_s - telling.since_s)
+            if at_end or now_s - telling.since_s >= telling.lasts_s:
+                self._tell_held(code, telling, now_s)
 
-    def _tell_held(self, code: str, telling: _Telling, lasted_s: float) -> None:
+    def _tell_held(self, code: str, telling: _Telling, now_s: float) -> None:
         newest = telling.newest
-        if newest is not None:
-            log.log(
-                LEVELS[newest.severity],
-                "%s (the last of %d more such events, %s, in %.0f s)",
-                newest.text,
-                telling.held,
-                code,
-                lasted_s,
-            )
+        if newest is None:
+            del self._tellings[code]
+            return
+        log.log(
+            LEVELS[newest.severity],
+            "%s (the last of %d more such events, %s, in %.0f s)",
+            newest.text,
+            telling.held,
+            code,
+            now_s - telling.since_s,
+        )
+        telling.since_s, telling.lasts_s = now_s, min(2 * telling.lasts_s, TELL_LONGEST_S)
+        telling.held, telling.newest = 0, None
 
     def _tell_set_up(self, set_up: SetUp) -> None:
         advised = any(m.aim is not None and m.aim.advice for m in set_up.markers)

@@ -48,8 +48,20 @@ def test_many_events_of_a_code_become_few_lines(
     (line,) = said(caplog)
     assert line == "missed after 49 (the last of 47 more such events, frames-missed, in 10 s)"
 
-    # After a while of peace each one is told again.
-    now_s[0] += 10
+    # As long as they go on, one line for twice as long.
+    missed(station, 5, 50)
+    now_s[0] += 19
+    station.tell()
+    assert said(caplog) == []
+    now_s[0] += 1
+    station.tell()
+    assert said(caplog) == [
+        "missed after 54 (the last of 5 more such events, frames-missed, in 20 s)"
+    ]
+
+    # After as long without any, each one is told again.
+    now_s[0] += 40
+    station.tell()
     missed(station, 2, 60)
     station.tell()
     assert said(caplog) == ["missed after 60", "missed after 61"]
