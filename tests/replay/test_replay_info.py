@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 
 import numpy as np
 import pytest
@@ -171,3 +173,12 @@ def test_bad_input_is_one_sentence_and_a_status(tmp_path, capsys):
         assert "no such file" in error
     assert run(["recover", "a", "b", "--out", "c"]) == 1
     assert "--out takes one file" in capsys.readouterr().err
+
+
+def test_a_disk_that_fails_while_reading_is_said_in_a_sentence(recording, capsys, monkeypatch):
+    def fail(self, start=0):
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(self.path))
+
+    monkeypatch.setattr(LogReader, "blocks", fail)
+    assert run(["info", str(recording)]) == 1
+    assert capsys.readouterr().err == f"vdms-replay: {recording}: input/output error\n"

@@ -43,6 +43,10 @@ def run(arguments: Sequence[str]) -> int:
         # Whoever read us has gone; the interpreter must not flush into it again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_FAILED
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"vdms-replay: {where}{(error.strerror or str(error)).lower()}", file=sys.stderr)
+        return EXIT_FAILED
 
 
 def parser() -> argparse.ArgumentParser:
