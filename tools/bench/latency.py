@@ -87,7 +87,7 @@ class StampedOutlet(Outlet):
         super().displacement(sample)
 
 
-def station(out: Path, ended: threading.Event) -> None:
+def station(out: Path, ended: threading.Event, ready: Callable[[], None]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         config = parse_config(
             f'[publish]\nlisten = ["tcp/127.0.0.1:{PORTS["station"]}"]\n'
@@ -95,6 +95,7 @@ def station(out: Path, ended: threading.Event) -> None:
             "bench",
         )
         scene = Scene.drawn(cycle_frames=30)
+        ready()
         ring, outlet = StampedRing(64), StampedOutlet()
         search = Search([m.shape for m in config.marker])
         outlet.recorder = Recorder(
@@ -116,7 +117,6 @@ def station(out: Path, ended: threading.Event) -> None:
             ]
             for thread in threads:
                 thread.start()
-            print("up", flush=True)
             feed(ring, scene, ended)
             ring.close()
             threads[1].join()
@@ -147,8 +147,9 @@ def feed(ring: Ring, scene: Scene, ended: threading.Event) -> None:
         due_ns += PERIOD_NS
 
 
-def reader(out: Path, ended: threading.Event) -> None:
+def reader(out: Path, ended: threading.Event, ready: Callable[[], None]) -> None:
     came: list[tuple[int, int]] = []
+    ready()
 
     def on_sample(sample: Sample) -> None:
         now_ns = time.monotonic_ns()
@@ -164,7 +165,8 @@ def reader(out: Path, ended: threading.Event) -> None:
 
 def session(mode: str, where: str) -> zenoh.Session:
     config = zenoh.Config()
-    for name, value in {**SESSION, "mode": mode, where: [bare_endpoint()]}.items():
+    settings = {"mode": mode, where: [bare_endpoint()], "connect/timeout_ms": 60_000}
+    for name, value in {**SESSION, **settings}.items():
         config.insert_json5(name, json.dumps(value))
     return zenoh.open(config)
 
@@ -173,8 +175,9 @@ def bare_endpoint() -> str:
     return f"tcp/127.0.0.1:{PORTS['bare']}"
 
 
-def bare_put(out: Path, ended: threading.Event) -> None:
+def bare_put(out: Path, ended: threading.Event, ready: Callable[[], None]) -> None:
     put: list[tuple[int, int]] = []
+    ready()
     with session("peer", "listen/endpoints") as own, own.declare_publisher("bare") as publisher:
         due_ns = time.monotonic_ns() + PERIOD_NS // 4
         while not ended.wait(max(0.0, (due_ns - time.monotonic_ns()) / 1e9)):
@@ -186,24 +189,23 @@ def bare_put(out: Path, ended: threading.Event) -> None:
     np.save(out, np.array(put, dtype=np.int64))
 
 
-def bare_reader(out: Path, ended: threading.Event) -> None:
+def bare_reader(out: Path, ended: threading.Event, ready: Callable[[], None]) -> None:
     came: list[tuple[int, int]] = []
 
     def on_sample(sample: zenoh.Sample) -> None:
         now_ns = time.monotonic_ns()
         came.append((int.from_bytes(sample.payload.to_bytes()[:8], "big"), now_ns))
 
-    while not ended.is_set():
-        try:
-            own = session("client", "connect/endpoints")
-        except zenoh.ZError:
-            continue
-        with own, own.declare_subscriber("bare", on_sample):
-            ended.wait()
+    ready()
+    with (
+        session("client", "connect/endpoints") as own,
+        own.declare_subscriber("bare", on_sample),
+    ):
+        ended.wait()
     np.save(out, np.array(came, dtype=np.int64))
 
 
-ROLES: dict[str, Callable[[Path, threading.Event], None]] = {
+ROLES: dict[str, Callable[[Path, threading.Event, Callable[[], None]], None]] = {
     "station": station,
     "reader": reader,
     "bare_put": bare_put,
@@ -212,12 +214,16 @@ ROLES: dict[str, Callable[[Path, threading.Event], None]] = {
 
 
 def run_role(role: str, out: Path, fifo: bool) -> None:
-    if fifo:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
     ended = threading.Event()
+
+    def ready() -> None:
+        if fifo:  # threads that come later inherit it
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+        print("up", flush=True)
+
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    ROLES[role](out, ended)
+    ROLES[role](out, ended, ready)
 
 
 def run(load: str, minutes: float, folder: Path, fifo: bool) -> dict[str, list[float]]:
@@ -229,26 +235,24 @@ def run(load: str, minutes: float, folder: Path, fifo: bool) -> dict[str, list[f
     for process in burning:
         process.start()
     files = {role: folder / f"{load}-{role}.npy" for role in ROLES}
-    children = [
-        subprocess.Popen(
-            [
-                *(sys.executable, "-m", __spec__.name, "--role", role, str(file)),
-                *(["--fifo"] if fifo else []),
-            ],
-            stdout=subprocess.PIPE,
-        )
-        for role, file in files.items()
-    ]
-    with children[0].stdout as drawn:
-        if not drawn.readline():
-            raise SystemExit("the station did not start")
-    time.sleep(SETTLE_S + 60 * minutes)
-    for child in reversed(children):
-        child.terminate()
-    if any(child.wait(60) for child in children):
+    children: list[subprocess.Popen[bytes]] = []
+    try:
+        for role, file in files.items():
+            command = [sys.executable, "-m", __spec__.name, "--role", role, str(file)]
+            child = subprocess.Popen([*command, *["--fifo"] * fifo], stdout=subprocess.PIPE)
+            children.append(child)
+            with child.stdout as said:
+                if not said.readline():
+                    raise SystemExit(f"{role} did not start")
+        time.sleep(SETTLE_S + 60 * minutes)
+    finally:
+        for child in reversed(children):
+            child.terminate()
+        for process in burning:
+            process.kill()
+    ended = [child.wait(60) for child in children]
+    if any(ended):
         raise SystemExit("a part of the bench failed")
-    for process in burning:
-        process.kill()
     return table({role: np.load(file) for role, file in files.items()})
 
 
