@@ -24,6 +24,7 @@ from vdms_rt.measure.centroid import otsu_circle
 from vdms_rt.measure.homography import GeometryError, homography
 from vdms_rt.measure.lens import (
     Lens,
+    distort_point,
     distort_px,
     fold_radius,
     lens_for,
@@ -54,6 +55,17 @@ def picture_points(count=500):
 def test_distorting_undoes_undistorting_all_over_the_picture(k1, k2, centre_px):
     lens, points = lens_of(k1, k2, centre_px), picture_points()
     assert np.abs(distort_px(lens, undistort_px(lens, points)) - points).max() < 1e-10
+
+
+@pytest.mark.parametrize(("k1", "k2"), LENSES)
+def test_one_point_in_plain_floats_is_the_same(k1, k2):
+    lens, points = lens_of(k1, k2), picture_points(50)
+    ideal = undistort_px(lens, points)
+    slopes = np.linalg.inv(undistort_jacobian(lens, points))
+    for (x, y), seen, slope in zip(ideal.tolist(), points, slopes, strict=True):
+        u, v, *row_by_row = distort_point(lens, x, y)
+        assert np.abs((u, v) - seen).max() < 1e-7
+        assert np.abs(np.reshape(row_by_row, (2, 2)) - slope).max() < 1e-7
 
 
 @pytest.mark.parametrize(("k1", "k2"), LENSES)

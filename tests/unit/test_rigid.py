@@ -147,3 +147,28 @@ def test_the_reference_has_its_share():
         motion = rigid_motion(reference, now, even(0.001), ALL)
         errors.append((motion.x_mm, motion.y_mm))
     assert np.allclose(np.var(errors, axis=0), np.diag(both), rtol=0.1)
+
+
+def test_circles_that_disagree_beyond_noise_are_doubted():
+    sigma = 0.001
+    quiet = SQUARE + 0.5 * sigma * np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
+    torn = quiet.copy()
+    torn[0] += (8 * sigma, 0.0)
+    covariances, tiny = even(sigma), spreads(even(1e-9))
+    spread = {}
+    for name, now in (("quiet", quiet), ("torn", torn)):
+        motion = rigid_motion(SQUARE, now, covariances, ALL)
+        spread[name] = rigid.position_covariance(motion, SQUARE.tolist(), tiny)
+    assert spread["quiet"][0] == pytest.approx(sigma**2 / 4, rel=1e-3)
+    # The marker is off by a quarter of what one circle is: within three of its sigmas.
+    assert 2 * sigma < 3 * spread["torn"][0] ** 0.5
+
+
+def test_noise_alone_is_hardly_ever_doubted():
+    rng = np.random.default_rng(5)
+    doubted = 0
+    for _ in range(4000):
+        now = SQUARE + 0.001 * rng.standard_normal((4, 2))
+        motion = rigid_motion(SQUARE, now, even(0.001), ALL)
+        doubted += motion.chi2 > rigid.BIRGE_LIMIT[1]
+    assert doubted <= 12

@@ -20,6 +20,9 @@ SHIFT_SHARE = 0.05
 """How far the shift to the mean over an exposure is known."""
 REFIT_SHARE = 0.5
 """The same for a circle that is measured by its edge, for which it is only like that."""
+SATURATED_SHARE = 2.5
+"""How much larger the error of a circle is whose disc is all saturated: its edge is clipped, and
+scatters 2.2 times as much."""
 NEAR_PX = 1.0
 FAR_PX = 3.0
 """How well a disturbed circle's place is known with and without other circles in the picture."""
@@ -51,6 +54,9 @@ def observe(
     flags = judge(readings, expected, limits, noise_grey, image.shape[1], frame_height_px)
     for flag in flags:
         if flag is not CircleFlag.NONE:
+            for k, what in enumerate(flags):
+                if what & CircleFlag.SATURATED:
+                    readings[k] = _coarser(readings[k])
             _refit(image, row_offset, row_step, expected, limits, slow, readings, flags, work)
             break
     if moving:
@@ -64,6 +70,12 @@ def observe(
             for reading, shift, flag in zip(readings, expected.shift_px, flags, strict=True)
         ]
     return readings, flags, later
+
+
+def _coarser(reading: CircleReading) -> CircleReading:
+    xx, xy, yy = reading.covariance_px2
+    part = SATURATED_SHARE * SATURATED_SHARE
+    return reading._replace(covariance_px2=(part * xx, part * xy, part * yy))
 
 
 def _shifted(

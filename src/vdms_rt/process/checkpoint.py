@@ -14,6 +14,7 @@ from vdms_rt.measure.smooth import Slow
 from vdms_rt.model import Region, Scan, VdmsError
 from vdms_rt.process.progress import Phase, Plan, Progress, Still, watches_of
 from vdms_rt.process.track import Track
+from vdms_rt.process.uneven import Uneven
 from vdms_rt.setup import SetUp
 
 
@@ -28,6 +29,7 @@ class _Watched:
     slow: tuple[tuple[Scan, Slow], ...]
     regions: tuple[Region, ...]
     track: Track
+    uneven: Uneven
     lost_since_ns: int | None
     relocated: bool
 
@@ -70,6 +72,7 @@ def checkpoint(progress: Progress) -> str:
                 tuple(watch.slow.items()),
                 watch.regions,
                 watch.track,
+                watch.uneven,
                 watch.lost_since_ns,
                 watch.relocated,
             )
@@ -125,6 +128,7 @@ def resumed(text: str, set_up: SetUp | None, session: int) -> Progress:
                 slow=dict(seen.slow),
                 regions=seen.regions,
                 track=seen.track,
+                uneven=seen.uneven,
                 lost_since_ns=seen.lost_since_ns,
                 relocated=seen.relocated,
             )

@@ -144,8 +144,9 @@ def _smooth(
         status |= Status.SATURATED
     if watch.relocated:
         status |= Status.RELOCATED
-    now: Pose = (motion.x_mm, motion.y_mm, motion.rotation_mrad)
     covariance = position_covariance(motion, view.zero_mm, view.covariance_mm2)
+    off_x, off_y = watch.uneven.of(picture.kind)
+    now: Pose = (motion.x_mm - off_x, motion.y_mm - off_y, motion.rotation_mrad)
     seen = Seen(circles, now, covariance, motion.residual_mm, course.velocity, status)
     track = watch.track.with_pose(picture.t_ns, now) if observation.agree else watch.track
     after = dataclasses.replace(
@@ -158,6 +159,7 @@ def _smooth(
             )
         ),
         track=track,
+        uneven=watch.uneven.after(picture.kind, picture.t_ns, now, watch.track, covariance),
         lost_since_ns=None,
         relocated=False,
     )

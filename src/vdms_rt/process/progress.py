@@ -29,6 +29,7 @@ from vdms_rt.measure.smooth import CircleReading, Slow
 from vdms_rt.measure.validity import Limits
 from vdms_rt.model import Circle, MarkerShape, Points, Region, Scan, State
 from vdms_rt.process.track import Track
+from vdms_rt.process.uneven import NO_UNEVEN, Uneven
 from vdms_rt.setup import FieldSetUp, MarkerSetUp, SetUp
 
 
@@ -103,6 +104,7 @@ class Watch:
     regions: tuple[Region, ...]
     """Where its circles are; with method smooth they go with them."""
     track: Track = Track()
+    uneven: Uneven = NO_UNEVEN
     lost_since_ns: int | None = None
     relocated: bool = False
     """Found again, and not yet measured since."""

@@ -34,7 +34,7 @@ class Course(NamedTuple):
     velocity: Pose = REST
     acceleration: Pose = REST
     doubt: Pose = REST
-    """How far the acceleration may be off: the last term of its series."""
+    """How far the acceleration may be off: about the last terms of its series."""
     slack_px: float = 0.0
     """How far off the pose may be, beyond the margin of a gate."""
 
@@ -78,12 +78,11 @@ class Track(NamedTuple):
         terms = _terms([*poses, (t_ns, pose)][-MOST_POSES:])
         per_s = 1e9 / (t_ns - poses[-1][0])
         bend = _BEND_NOW[len(terms) - 1] * per_s * per_s
-        last_x, last_y, last_r = terms[-1]
         return Course(
             pose,
             _sum(terms, _SLOPE_NOW, per_s),
             _sum(terms, _BEND_NOW, per_s * per_s),
-            (bend * last_x, bend * last_y, bend * last_r),
+            _doubt(terms[-2:], bend),
         )
 
 
@@ -133,6 +132,14 @@ def _sum(terms: list[Pose], factors: list[float], scale: float) -> Pose:
         x += tx * factor
         y += ty * factor
         r += tr * factor
+    return x * scale, y * scale, r * scale
+
+
+def _doubt(last: list[Pose], scale: float) -> Pose:
+    """Return how large the first term that was left out may be. Any one term of a harmonic may be
+    near 0, so it is told by two."""
+    (ax, ay, ar), (bx, by, br) = last
+    x, y, r = (max(abs(a) / 2, abs(b)) for a, b in ((ax, bx), (ay, by), (ar, br)))
     return x * scale, y * scale, r * scale
 
 
