@@ -13,7 +13,7 @@ from hosts import Host, Hosts, needs_root, running, two_hosts
 
 from vdms_rt import keys
 
-pytestmark = [needs_root, pytest.mark.slow]
+pytestmark = [needs_root, pytest.mark.slow, pytest.mark.timeout(400)]
 
 DEADLINE_S = 60.0
 FORGE = """
@@ -124,6 +124,29 @@ def test_a_station_tells_everyone_and_is_told_by_its_own_computer_alone(
         )
     assert not (plain / "x.jpg").exists()
     assert "measuring" in ctl(hosts.station, "status").stdout
+
+
+GUESS = """
+import json, sys, zenoh
+from vdms_rt.wire.session import SESSION
+config = zenoh.Config()
+settings = {"mode": "client", "connect/endpoints": [sys.argv[1]], "connect/timeout_ms": 20000}
+for name, value in {**SESSION, **settings}.items():
+    config.insert_json5(name, json.dumps(value))
+anything = {"accept_replies": zenoh.ReplyKeyExpr.ANY, "timeout": 20}
+with zenoh.open(config) as session:
+    for key in ("**", "vdms/**", "vdms/lab/**", "vdms/lab/control/*", "vdms/*/control/zero"):
+        assert not list(session.get(key, target=zenoh.QueryTarget.ALL, **anything)), key
+    kept = session.get("vdms/lab/m1/displacement/@adv/**", **anything)
+    print(len([reply for reply in kept if reply.ok is not None]))
+"""
+
+
+def test_a_reader_gets_around_it_by_no_other_key(hosts: Hosts, plain: Path) -> None:
+    there = f"tcp/{hosts.station.address}:7447"
+    guessed = hosts.laptop.run("-c", GUESS, there)
+    assert guessed.returncode == 0, guessed.stderr
+    assert int(guessed.stdout) > 0
 
 
 def test_nothing_else_listens(hosts: Hosts, plain: Path) -> None:

@@ -16,7 +16,7 @@ from reading import Reader
 from vdms_rt.logfile.reader import LogReader, StoredMessage
 from vdms_rt.wire import vdms_pb2 as pb
 
-pytestmark = [needs_root, pytest.mark.slow]
+pytestmark = [needs_root, pytest.mark.slow, pytest.mark.timeout(400)]
 
 PORT = 7447
 TESTS = ROOT / "tests"
@@ -78,7 +78,6 @@ def cut(hosts: Hosts, listening: Reader, session: int, seconds: float) -> None:
         pytest.param(30, 3, marks=pytest.mark.soak),
     ],
 )
-@pytest.mark.timeout(400)
 def test_a_pulled_cable_costs_no_sample(hosts: Hosts, seconds: float, times: int) -> None:
     with station(hosts.station, 7), reader(hosts) as listening:
         listening.wait(7, 60)
@@ -93,7 +92,6 @@ def test_a_pulled_cable_costs_no_sample(hosts: Hosts, seconds: float, times: int
 @pytest.mark.parametrize(
     ("seconds", "recover_s"), [(6, 2.0), pytest.param(90, 60.0, marks=pytest.mark.soak)]
 )
-@pytest.mark.timeout(400)
 def test_what_a_longer_cut_cost_is_told_exactly(
     hosts: Hosts, seconds: float, recover_s: float
 ) -> None:
@@ -154,7 +152,6 @@ def test_a_stopped_reader_holds_up_nobody_else(hosts: Hosts) -> None:
         assert one.missed == []
 
 
-@pytest.mark.timeout(300)
 def test_a_stopped_reader_costs_a_whole_station_nothing(hosts: Hosts, tmp_path: Path) -> None:
     with (
         running(hosts.station, tmp_path, "") as recordings,
