@@ -109,6 +109,8 @@ class Board:
             marker = self._station(name).markers.setdefault(notice.marker, MarkerView())
             marker.missed += notice.count
             marker.on_the_way += notice.on_the_way
+            if not notice.on_the_way:
+                return  # the station has told of it itself
         text = str(notice).removeprefix(f"{name}: ")
         self._tell(name, now_s, severity, type(notice).__name__.lower(), text)
 

@@ -144,11 +144,11 @@ export class Look {
   make_spectrum() {
     const root = byId("spectrum"), ink = () => colour("--muted"), grid = { stroke: () => colour("--grid"), width: 1 };
     const plot = new uPlot({
-      width: 320, height: 150, padding: [14, 8, 0, 0], legend: { show: false }, cursor: { show: false },
+      width: 320, height: 150, padding: [14, 8, 0, 0], pxAlign: 0, legend: { show: false }, cursor: { show: false },
       scales: { x: { time: false }, y: { distr: 3, range: (u, low, high) => [Math.max(low, high / 1e5) / 2, high * 3] } },
       axes: [
         { stroke: ink, grid, ticks: grid, size: 26, values: (u, at) => at.map((hz, i) => (i === at.length - 1 ? `${hz} Hz` : `${hz}`)) },
-        { stroke: ink, grid, ticks: grid, size: 58, values: (u, at) => at.map((v) => (v === null ? "" : v >= 0.1 ? `${v} mm` : `${+(v * 1000).toPrecision(1)} µm`)) },
+        { stroke: ink, grid: { show: false }, ticks: { show: false }, size: 58, values: (u, at) => at.map((v) => (v === null ? "" : v >= 0.1 ? `${v} mm` : `${+(v * 1000).toPrecision(1)} µm`)) },
       ],
       series: [{}, { stroke: () => colour(`--${byId("spectrum-axis").value}`), width: 1.5, points: { show: false } }],
       hooks: { draw: [(u) => this.name_peaks(u)] },

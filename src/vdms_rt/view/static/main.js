@@ -86,7 +86,7 @@ function show_station() {
   define(byId("facts"), [
     ["standing", marker?.standing ?? "–", marker?.valid ? "" : "warn"],
     ["rate", `${plain(health.frame_rate_hz, 2)} frames/s, ${plain(store.rate_hz(), 2)} samples/s`],
-    ["lost", `${lost} frames, ${health.invalid} samples invalid`, lost ? "warn" : ""],
+    ["lost", `${lost} frames, ${health.invalid} invalid samples`, lost ? "warn" : ""],
     ["this page", page.skipped ? `skipped ${page.skipped}` : marker?.on_the_way ? `${marker.on_the_way} samples lost on the way` : "has every sample", page.skipped || marker?.on_the_way ? "warn" : ""],
     ["recording", health.record_trouble || health.recording.split("/").pop() || "no", health.record_trouble ? "bad" : ""],
     ["disk left", bytes(health.disk_free_bytes), health.disk_free_bytes < 5e9 ? "warn" : ""],

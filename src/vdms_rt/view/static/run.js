@@ -5,6 +5,7 @@ import { byId, bytes, clock, date, duration, element } from "/static/format.js";
 
 const LIST_MS = 3000;
 const EVENTS_SHOWN = 100;
+const REPEATED = ["frames-missed", "frames-overwritten", "missed"];
 
 export class Run {
   /** `page` has station, may_control, tell(answer). */
@@ -67,7 +68,7 @@ export class Run {
     }
     body.replaceChildren(...recordings.slice(0, 200).map((r) => {
       const begin_s = Number(r.begin_utc_ns) / 1e9;
-      const cells = [`${date(begin_s)} ${clock(begin_s)}`, r.run, r.open && !r.length_s ? "being written" : duration(r.length_s), bytes(Number(r.size_bytes)), r.name];
+      const cells = [`${date(begin_s)} ${clock(begin_s)}`, r.run || "–", r.open && !r.length_s ? "being written" : duration(r.length_s), bytes(Number(r.size_bytes)), r.name];
       const row = element("tr", {}, ...cells.map((text) => element("td", { textContent: text })));
       row.children[2].className = row.children[3].className = "number";
       row.children[4].className = "name";
@@ -78,7 +79,16 @@ export class Run {
   events(news) {
     const list = byId("events");
     for (const event of news) {
+      const kind = `${event.station} ${event.code}`, newest = list.firstChild;
       const item = element("li", { className: `s${event.severity}` }, element("time", { textContent: clock(event.utc_s) }), `${event.station ? `${event.station}: ` : ""}${event.text}`);
+      item.dataset.kind = kind;
+      item.dataset.times = 1;
+      // What happens many times in a row is one line.
+      if (REPEATED.includes(event.code) && newest?.dataset.kind === kind) {
+        item.dataset.times = Number(newest.dataset.times) + 1;
+        item.append(element("b", { textContent: `× ${item.dataset.times}` }));
+        newest.remove();
+      }
       list.prepend(item);
     }
     while (list.children.length > EVENTS_SHOWN) list.lastChild.remove();

@@ -224,7 +224,7 @@ function aim_rows(aim) {
     ["focus", `${aim.focus}: edges ${plain(aim.edge_x_px, 1)} × ${plain(aim.edge_y_px, 1)} px`, aim.focus === "sharp" ? "" : "warn"],
     ["exposure", `black ${plain(aim.black_grey, 0)}, white ${plain(aim.white_grey, 0)}, ${plain(aim.saturated_percent, 1)} % saturated`, aim.saturated_percent > 0.5 ? "warn" : ""],
     ["tilt", tilt],
-    ["roll", `${plain(Math.abs(aim.roll_deg), 1)} deg ${aim.roll_deg > 0 ? "counter-clockwise" : "clockwise"}`],
+    ["roll", Math.abs(aim.roll_deg) < 0.05 ? "none" : `${plain(Math.abs(aim.roll_deg), 1)} deg ${aim.roll_deg > 0 ? "counter-clockwise" : "clockwise"}`],
     ["scale", `${plain(aim.scale_x_px_per_mm, 3)} px/mm across, ${plain(aim.scale_y_px_per_mm, 3)} up`],
     ["noise", `${plain(aim.noise_grey, 1)} grey levels`],
     ["room", `${plain(aim.left_mm, 0)} mm left, ${plain(aim.right_mm, 0)} right, ${plain(aim.up_mm, 0)} up, ${plain(aim.down_mm, 0)} down`],

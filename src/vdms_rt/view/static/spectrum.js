@@ -2,6 +2,8 @@
 
 const SHORTEST = 128;
 const LONGEST = 4096;
+const LOBES = 6;
+const LEAST = 0.002;
 
 /** In-place radix-2 transform of re + i im, whose length is a power of two. */
 function fft(re, im) {
@@ -70,7 +72,8 @@ export function spectrum(t, v, period_s) {
   };
 }
 
-/** The strongest peaks, at least 2 % of the strongest and clear of what is around them.
+/** The strongest peaks that stand out of the noise and are no side lobes of a stronger one: those
+ * of a Hann window are under LEAST beyond LOBES lines.
  *
  * Between the lines by the ratio of the two highest, which is exact for a sine in a Hann window
  * (Grandke 1983). */
@@ -80,7 +83,7 @@ export function peaks({ amplitude, step_hz }, most) {
   const found = [];
   for (let k = 2; k < amplitude.length - 2; k++) {
     const a = amplitude[k];
-    if (a <= amplitude[k - 1] || a < amplitude[k + 1] || a < floor) continue;
+    if (a < floor || a < Math.max(...amplitude.subarray(Math.max(k - LOBES, 0), k + LOBES + 1))) continue;
     const up = amplitude[k + 1] > amplitude[k - 1];
     const ratio = (up ? amplitude[k + 1] : amplitude[k - 1]) / a;
     const off = Math.min(Math.max((2 * ratio - 1) / (ratio + 1), 0), 0.5);
@@ -88,5 +91,5 @@ export function peaks({ amplitude, step_hz }, most) {
     found.push({ hz: (k + (up ? off : -off)) * step_hz, amplitude: a * loss });
   }
   found.sort((p, q) => q.amplitude - p.amplitude);
-  return found.filter((p) => p.amplitude >= 0.02 * found[0].amplitude).slice(0, most);
+  return found.filter((p) => p.amplitude >= LEAST * found[0].amplitude).slice(0, most);
 }

@@ -50,7 +50,7 @@ export class TimePlot {
     const ink = () => colour("--muted"), grid = { stroke: () => colour("--grid"), width: 1 };
     const line = () => colour(`--${axis}`), none = { show: false };
     this.plot = new uPlot({
-      width: 400, height: 120, padding: [8, 6, 0, 0], legend: none,
+      width: 400, height: 120, padding: [8, 6, 0, 0], legend: none, pxAlign: 0,
       scales: { x: { time: true, range: () => [view.from_s, view.to_s] }, y: { range: () => this.range } },
       axes: [
         { stroke: ink, grid, ticks: grid, size: 26, space: 90, values: (u, at, _, __, step) => at.map((s) => clock(s, step < 1 ? (step < 0.1 ? 2 : 1) : 0)) },
