@@ -39,6 +39,8 @@ class Device:
         self._source: V4l2Source | None = None
         self._remedy = Remedy.NONE
         self._warned: set[str] = set()
+        self._mended: set[str] = set()
+        """What was told of remedies since frames came: a camera may be off for hours."""
         self._signal = UNSURE
         self._asked_s = self._looked_s = self._compared_s = 0.0
         self._trusted = False
@@ -148,8 +150,10 @@ class Device:
                 reset_usb(self._before.usb_port)
             except SourceError as error:
                 text = str(error)
-        facts = (("remedy", remedy.value),)
-        self._report(Event(Severity.WARNING, "remedy", text, facts=facts))
+        if text not in self._mended:
+            self._mended.add(text)
+            facts = (("remedy", remedy.value),)
+            self._report(Event(Severity.WARNING, "remedy", text, facts=facts))
         return True
 
     def wait(self, stop: threading.Event) -> None:
@@ -204,6 +208,8 @@ class Device:
 
     def _tell(self, change: Change | None) -> None:
         if change is not None:
+            if change.state is State.STREAMING:
+                self._mended = set()
             facts = (("state", change.state.value),)
             self._report(Event(change.severity, "state", change.text, facts=facts))
 
