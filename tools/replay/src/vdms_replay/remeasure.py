@@ -40,6 +40,10 @@ SET_UP, CHECKPOINT, PIXELS = "vdms.SetUp", "vdms.Checkpoint", "vdms.Pixels"
 SAMPLE, EVENT = "vdms.Displacement", "vdms.Event"
 
 
+_WORK = Workspace()
+"""Scratch, one for each process: the windows that one piece has made serve the next."""
+
+
 class Change(NamedTuple):
     """What is to be otherwise than it was; None leaves it."""
 
@@ -147,7 +151,7 @@ class Walk:
         self.set_ups = dict(set_ups)
         """JSON by revision, as the log has them."""
         self._waiting: deque[pb.Checkpoint] = deque()
-        self._work = Workspace()
+        self._work = _WORK
         self._image: Luma = np.zeros((0, 0), np.uint8)
 
     def take(self, type_: str, data: bytes) -> list[Said]:
