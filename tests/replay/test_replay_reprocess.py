@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
@@ -15,7 +16,10 @@ import vdms_replay.pieces
 from vdms_replay import read
 from vdms_replay.cli import run
 from vdms_replay.reprocess import reprocess
-from vdms_replay.source import ReplayError, Source
+from vdms_replay.source import TYPES, ReplayError, Source
+from vdms_rt.logfile.reader import LogReader, StoredMessage
+from vdms_rt.logfile.writer import LogMessage, LogWriter
+from vdms_rt.wire import vdms_pb2 as pb
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +167,28 @@ def test_a_marker_that_was_covered_and_searched_again_has_the_same_bits(tmp_path
     account = reprocess(path, out=tmp_path / "again.mcap", jobs=1)
     assert account.other == 0
     assert account.same > 400
+
+
+@pytest.mark.slow
+def test_checkpoints_of_another_version_are_no_obstacle(recording: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.mcap"
+    with LogReader(recording) as old, contextlib.closing(LogWriter(other)) as new:
+        for record_ in old:
+            if isinstance(record_, StoredMessage):
+                assert record_.schema is not None
+                type_ = TYPES[record_.schema.name]
+                value = type_.FromString(record_.message.data)
+                if isinstance(value, pb.Checkpoint):
+                    value.json = value.json.replace('"slow":', '"slow_figures":')
+                    value.json = value.json.replace('"evidence":', '"proof":')
+                at_ns = record_.message.log_time
+                data = value.SerializeToString()
+                new.add(LogMessage(record_.channel.topic, type_, 0, at_ns, at_ns, data))
+    account = reprocess(other, out=tmp_path / "again.mcap", jobs=1)
+    assert account.worst_mm < 1e-3
+    assert (account.status_other, account.without_pixels) == (0, 0)
+    told = "\n".join(account.sentences())
+    assert "of another version of vdms-rt; it was measured from its reference on" in told
 
 
 def test_the_command_line(

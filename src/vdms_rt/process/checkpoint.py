@@ -56,7 +56,24 @@ class _Checkpoint:
     has_set_up: bool
 
 
+@dataclass(frozen=True, slots=True)
+class _Outline:
+    """Of a checkpoint, what a person has set and the set-up needs; other versions have it too."""
+
+    plan: Plan
+    width_px: int
+    height_px: int
+    phase: Phase
+    regions: tuple[tuple[Region, ...], ...]
+    exposure_ns: int
+    period_ns: int
+    revision: int
+    order: Scan | None
+    has_set_up: bool
+
+
 _TEXT = TypeAdapter(_Checkpoint)
+_OUTLINE = TypeAdapter(_Outline)
 
 
 def checkpoint(progress: Progress) -> str:
@@ -92,6 +109,45 @@ def checkpoint(progress: Progress) -> str:
     return _TEXT.dump_json(value).decode()
 
 
+def is_current(text: str) -> bool:
+    """Return whether `resumed` can go on from a checkpoint: not from every other version's."""
+    try:
+        _TEXT.validate_json(text)
+    except ValidationError:
+        return False
+    return True
+
+
+def outlined(text: str, set_up: SetUp | None, session: int) -> Progress:
+    """Return the run that `checkpoint` described without what it had learnt from its pictures; also
+    of another version. Its watches are empty. Raises CheckpointError as `resumed` does."""
+    try:
+        value = _OUTLINE.validate_json(text)
+    except ValidationError:
+        raise CheckpointError("a recorded checkpoint is not one of this version") from None
+    return Progress(
+        plan=value.plan,
+        session=session,
+        width_px=value.width_px,
+        height_px=value.height_px,
+        phase=value.phase,
+        regions=value.regions,
+        set_up=_in_force(value, set_up),
+        exposure_ns=value.exposure_ns,
+        period_ns=value.period_ns,
+        revision=value.revision,
+        order=value.order,
+    )
+
+
+def _in_force(value: _Checkpoint | _Outline, set_up: SetUp | None) -> SetUp | None:
+    if value.has_set_up and set_up is None:
+        raise CheckpointError(
+            f"the set-up of revision {value.revision} stands in no readable part of the recording"
+        )
+    return set_up if value.has_set_up else None
+
+
 _watches_of = lru_cache(maxsize=8)(watches_of)
 """Many checkpoints stand against one set-up, and what follows from it costs tens of frames."""
 
@@ -105,13 +161,10 @@ def resumed(text: str, set_up: SetUp | None, session: int) -> Progress:
         value = _TEXT.validate_json(text)
     except ValidationError:
         raise CheckpointError("a recorded checkpoint is not one of this version") from None
-    if value.has_set_up and set_up is None:
-        raise CheckpointError(
-            f"the set-up of revision {value.revision} stands in no readable part of the recording"
-        )
+    in_force = _in_force(value, set_up)
     watches = (
-        _watches_of(set_up, value.plan, value.exposure_ns, value.period_ns)
-        if set_up is not None and value.watched
+        _watches_of(in_force, value.plan, value.exposure_ns, value.period_ns)
+        if in_force is not None and value.watched
         else ()
     )
     return Progress(
@@ -121,7 +174,7 @@ def resumed(text: str, set_up: SetUp | None, session: int) -> Progress:
         height_px=value.height_px,
         phase=value.phase,
         regions=value.regions,
-        set_up=set_up if value.has_set_up else None,
+        set_up=in_force,
         watches=tuple(
             replace(
                 watch,

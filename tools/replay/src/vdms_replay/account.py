@@ -19,6 +19,8 @@ class Account:
     out: Path
     jobs: int
     changed: bool
+    other_version: bool = False
+    """The checkpoints are of a version from which this one cannot go on."""
     frames: int = 0
     recorded_s: float = 0.0
     """Time that the frames span in the recording."""
@@ -50,6 +52,11 @@ class Account:
             f"{self.jobs} process{'es' if self.jobs > 1 else ''}",
             self._agreement(),
         ]
+        if self.other_version:
+            told.append(
+                "its checkpoints are of another version of vdms-rt; it was measured from its "
+                "reference on"
+            )
         if self.without_pixels:
             told.append(
                 f"{self.without_pixels} valid samples of the recording have no pixels there, and "

@@ -20,7 +20,7 @@ from vdms_rt.config import Lens
 from vdms_rt.measure.gate import Workspace
 from vdms_rt.measure.marker import find_markers
 from vdms_rt.model import Damage, Displacement, Event, Frame, Luma, Picture, Region, Scan
-from vdms_rt.process.checkpoint import checkpoint, resumed
+from vdms_rt.process.checkpoint import checkpoint, outlined, resumed
 from vdms_rt.process.observing import relocated
 from vdms_rt.process.pictures import pictures
 from vdms_rt.process.progress import Phase, Progress, Watch, lost_long, watches_of
@@ -241,8 +241,9 @@ class Walk:
             return now
         text = self.set_ups.get(said.setup_revision)
         set_up = None if text is None else set_up_from_json(text)
-        there = resumed(said.json, set_up, self._session)
-        return there if self._change.nothing else _as_changed(there, now, self._change)
+        if self._change.nothing:
+            return resumed(said.json, set_up, self._session)
+        return _as_changed(outlined(said.json, set_up, self._session), now, self._change)
 
     def _prepared(self, progress: Progress, picture: Picture, pixels: pb.Pixels) -> Progress:
         """Return the run with the recorded places of the circles, where a change needs them."""

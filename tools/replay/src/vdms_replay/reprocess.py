@@ -82,13 +82,23 @@ def reprocess(
     with a section [lens]) leaves what was recorded; `jobs` processes, one for each core for None.
     The numbers do not depend on `jobs`. Raises ReplayError with a sentence.
     """
-    from vdms_replay.reprocessing import Job, Settings, measuring, read_lens, survey, writing_log
+    from vdms_replay.reprocessing import (
+        Job,
+        Settings,
+        is_current,
+        measuring,
+        read_lens,
+        survey,
+        writing_log,
+    )
 
     began_s = time.monotonic()
     source = Source(files)
     first = source.paths[0]
     out = out or first.with_name(f"{first.name.partition('.mcap')[0]}-again.mcap")
     settings = Settings(method, sampling, None if lens is None else read_lens(lens), refit_time)
+    if not settings.changed and not is_current(source):
+        settings = settings._replace(other_version=True)
     account = Account(out, jobs or len(os.sched_getaffinity(0)), settings.changed)
     known = survey(source, advance, times=refit_time) if settings.changed else {}
     try:
@@ -102,6 +112,7 @@ def reprocess(
             f"{first}: holds a message that cannot be decoded; was it recorded by a newer version "
             "of vdms-rt?"
         ) from None
+    account.other_version = settings.other_version
     account.took_s = time.monotonic() - began_s
     account.damage = [s for one in source.damage.values() for s in one.sentences()]
     return account

@@ -44,6 +44,7 @@ from vdms_rt.config.camera import lens_of_file
 from vdms_rt.logfile.reader import StoredMessage
 from vdms_rt.logfile.writer import LogAttachment, LogMessage, LogWriter
 from vdms_rt.model import Scan
+from vdms_rt.process import checkpoint
 from vdms_rt.setup import SetUpError, set_up_from_json
 from vdms_rt.wire import topics
 from vdms_rt.wire import vdms_pb2 as pb
@@ -65,6 +66,8 @@ class Settings(NamedTuple):
     sampling: str | None
     lens: Lens | None
     refit_time: bool
+    other_version: bool = False
+    """Where measuring stood in the recording cannot be taken over."""
 
     @property
     def changed(self) -> bool:
@@ -85,6 +88,14 @@ def read_lens(path: Path) -> Lens:
         return lens_of_file(Lens(file=str(path)))
     except ValueError as error:
         raise ReplayError(str(error)) from None
+
+
+def is_current(source: Source) -> bool:
+    """Return whether the recording's first checkpoint is of this version; True without any."""
+    for message in _messages(source, lambda _: None):
+        if isinstance(message, _Message) and message.type == CHECKPOINT:
+            return checkpoint.is_current(pb.Checkpoint.FromString(message.data).json)
+    return True
 
 
 def survey(source: Source, advance: Advance, *, times: bool) -> dict[int, Known]:
@@ -249,7 +260,7 @@ class Job:
             exposure_ns = round(1e9 * exposure_of(config))
             delay_ns = round(1e6 * config.get("camera", {}).get("chain_delay_ms", 0.0))
             times = refitted(known.stamps.rows, exposure_ns, delay_ns)
-        anew = settings.sampling is not None or settings.refit_time
+        anew = settings.sampling is not None or settings.refit_time or settings.other_version
         change = Change(settings.method, settings.lens, anew, known.order, was)
         terms = Terms(run.session, sampling, change, times)
         return Changed(terms) if settings.changed else AsItWas(terms)
