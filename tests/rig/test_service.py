@@ -160,6 +160,10 @@ def test_an_upgrade_keeps_the_configuration_and_restarts(installed: str) -> None
 
 
 def test_removed_it_leaves_what_was_measured(installed: str) -> None:
+    # The software itself goes first: to remove its 7000 files takes the guest minutes.
+    run("systemctl", "stop", "vdms-rt")
+    run("umount", "/opt/vdms-rt")
+    Path("/opt/vdms-rt/0123456789ab/bin").mkdir(parents=True)
     recordings = {path.name.removesuffix(".part") for path in RECORDINGS.iterdir()}
     said = service.make("uninstall")
     assert "/var/log/vdms-rt stays" in said
@@ -168,4 +172,4 @@ def test_removed_it_leaves_what_was_measured(installed: str) -> None:
     assert CONFIG.exists()
     assert SET_UP.exists()
     assert not Path("/usr/local/bin/vdms-rt").exists()
-    assert not list(Path("/opt/vdms-rt").iterdir())
+    assert not Path("/opt/vdms-rt").exists()
