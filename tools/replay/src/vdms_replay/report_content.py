@@ -208,7 +208,7 @@ def _about_lines(lines: Lines | None) -> str:
         return "Too few samples for a spectrum, or too many are missing."
     text = (
         f"Spectrum: mean over Hann windows, resolution {lines.resolution_hz:.3g} Hz; the height of "
-        "a peak is the amplitude of a steady sine."
+        "a peak is the amplitude of a steady sine; one that does not last all the time shows less."
     )
     if lines.filled:
         text += f" {lines.filled} missing samples were interpolated for it."
