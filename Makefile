@@ -52,8 +52,9 @@ test: check ## everything that runs without a kernel of its own
 quick: $(VENV)/replay.stamp ## the fast tests alone
 	@$(BIN)/pytest -q -m "not rig and not slow and not soak"
 
-soak: $(VENV)/replay.stamp ## the long tests: faults many times over (as root, or some are skipped)
+soak: $(VENV)/replay.stamp ## the long tests, also in the virtual machine: faults many times over (as root)
 	@$(BIN)/pytest -m "soak and not rig"
+	@tests/rig/run --soak
 
 rig: $(VENV)/dev.stamp ## the tests on real kernel drivers, in a virtual machine (DEVICE=...: on that grabber)
 	@$(if $(DEVICE),$(BIN)/pytest -s -m "hardware and not soak" --device $(DEVICE) tests/rig,tests/rig/run)

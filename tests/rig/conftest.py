@@ -6,6 +6,15 @@ import numpy as np
 import pytest
 from rig import frames
 from rig.devices import FRAMES_FILE, Grabber, Vivid
+from rig.hands import Hands, Person
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--device",
+        metavar="DEVICE",
+        help="run the tests marked `hardware` on this real grabber: a node, USB id, serial or port",
+    )
 
 
 @pytest.fixture(scope="session")
@@ -33,6 +42,14 @@ def usbtv(usbtv_emulator):
     """An emulated EasyCAP that is not plugged in yet."""
     yield usbtv_emulator
     usbtv_emulator.reset()
+
+
+@pytest.fixture
+def hands(request):
+    """Who handles a grabber that is not plugged in yet, or in a real test, may be."""
+    if device := request.config.getoption("--device", None):
+        return Person(device)
+    return Hands(request.getfixturevalue("usbtv"))
 
 
 @pytest.fixture(autouse=True)

@@ -76,6 +76,14 @@ class Vivid:
         run("modprobe", "-r", "vivid")
 
 
+def show(vivid: Vivid, control: str, choice: str) -> None:
+    """Choose an entry of one of vivid's menus by its name, or by the first that begins so."""
+    menu = run("v4l2-ctl", "-d", vivid.node, "--list-ctrls-menus").split(f"{control} 0x")[1]
+    lines = (line.strip() for line in menu.splitlines())
+    number = next(line.split(":")[0] for line in lines if f": {choice}" in line)
+    vivid.control(control, int(number))
+
+
 class Projector:
     """Shows the frames on vivid's S-Video output, which its S-Video inputs then see: the marker
     at rest until `move` is set. A context manager.
@@ -122,19 +130,22 @@ class Projector:
 
 
 class Grabber:
-    """An emulated USB grabber and its cable. `kind` is `usbtv` or `uvc`."""
+    """An emulated USB grabber and its cable. `kind` is `usbtv` or `uvc`; two at once need two
+    `tcp_port`."""
 
-    def __init__(self, kind: str, serial: str, control: Path) -> None:
+    def __init__(self, kind: str, serial: str, control: Path, tcp_port: int = 3240) -> None:
         run("modprobe", "vhci-hcd")
         run("modprobe", {"usbtv": "usbtv", "uvc": "uvcvideo"}[kind])
         self.serial = serial
+        self._tcp_port = str(tcp_port)
         self._control = control
         self._log = control / "grabber.log"
         command = [sys.executable, "-m", "rig.virtual_grabber", kind, str(FRAMES_FILE)]
         environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "tests")}
         with self._log.open("w") as log:
+            command += ["--serial", serial, "--control", str(control)]
             self._server = subprocess.Popen(
-                [*command, "--serial", serial, "--control", str(control)],
+                [*command, "--tcp-port", self._tcp_port],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=environment,
@@ -148,7 +159,8 @@ class Grabber:
 
     def plug(self) -> DeviceInfo:
         """Plug it in and return the capture device that it becomes."""
-        run("usbip", "attach", "-r", "127.0.0.1", "-b", usbip.BUS_ID)
+        port = ("--tcp-port", self._tcp_port)
+        run("usbip", *port, "attach", "-r", "127.0.0.1", "-b", usbip.BUS_ID)
         return wait_for(self.device, "the grabber's node")
 
     def device(self) -> DeviceInfo | None:
@@ -157,11 +169,23 @@ class Grabber:
         return found[0] if found else None
 
     def unplug(self) -> None:
-        run("usbip", "detach", "-p", "0")
+        run("usbip", "detach", "-p", str(self._vhci_port()))
         wait_for(lambda: not self.device(), "the grabber's node to go")
 
+    def _vhci_port(self) -> int:
+        """Return the emulated host's port that it is plugged into."""
+        (status,) = Path("/sys/devices/platform").glob("vhci_hcd.0/status")
+        rows = [line.split() for line in status.read_text().splitlines()[1:]]
+        serials = {row[1]: Path("/sys/bus/usb/devices") / row[-1] / "serial" for row in rows}
+        return next(
+            int(port)
+            for port, file in serials.items()
+            if file.exists() and file.read_text().strip() == self.serial
+        )
+
     def set(self, what: str, on: bool) -> None:
-        """`hold`: show the marker at rest. `stall`: send nothing."""
+        """`hold`: show the marker at rest. `blank`: show nothing. `stall`: send nothing. `wedge`:
+        send nothing until it is reset."""
         flag = self._control / what
         if on:
             flag.touch()
@@ -170,7 +194,7 @@ class Grabber:
 
     def reset(self) -> None:
         """Leave it unplugged, and as it was at first."""
-        for what in ("hold", "stall"):
+        for what in ("hold", "blank", "stall", "wedge"):
             self.set(what, False)
         if self.device():
             self.unplug()

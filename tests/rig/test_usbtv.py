@@ -60,6 +60,22 @@ def test_standard_is_assumed_and_pal_is_accepted(usbtv):
         assert source.info.frame_period_s == Fraction(1, 25)
 
 
+def test_what_its_controls_cannot_do_is_said(usbtv):
+    usbtv.plug()
+    with opened(brightness=400) as source:
+        facts, (warning,) = dict(source.info.facts), source.info.warnings
+        assert facts["brightness"] == "400 of 0 to 1023"
+    assert warning.endswith(
+        "has no switch for automatic gain or exposure; switch them off at the camera, and keep the "
+        "light steady while it measures"
+    )
+    with pytest.raises(SourceError) as caught:
+        opened(gain=1)
+    assert str(caught.value).endswith(
+        "has no control for gain; leave v4l2.gain out of the configuration"
+    )
+
+
 def test_no_frames_then_frames_again(usbtv):
     usbtv.plug()
     with opened() as source:

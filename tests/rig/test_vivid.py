@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig.devices import Projector, Vivid, run
+from rig.devices import Projector, Vivid, run, show
 from rig.frames import PERIOD_FRAMES, REST_FRAMES
 from rig.reading import last_words, new_image, skip_to_known, take, take_known
 
@@ -32,14 +32,6 @@ def refusal(node: str, field: int = api.FIELD_INTERLACED, **settings) -> str:
     with pytest.raises(SourceError) as caught:
         V4l2Source(V4l2(device=node, **settings), field)
     return str(caught.value)
-
-
-def show(vivid: Vivid, pattern: str) -> None:
-    """Choose vivid's test pattern by its name."""
-    menu = run("v4l2-ctl", "-d", vivid.node, "--list-ctrls-menus")
-    lines = (line.strip() for line in menu.splitlines())
-    number = next(line.split(":")[0] for line in lines if line.endswith(f": {pattern}"))
-    vivid.control("test_pattern", int(number))
 
 
 def test_300_ntsc_frames_of_the_marker(vivid, pictures):
@@ -99,7 +91,7 @@ def test_standard_that_is_not_detected_is_ntsc(vivid):
 
 def test_luma_is_the_same_in_every_pixel_format(vivid):
     # Without colour, for vivid weighs colours otherwise in its grey pictures.
-    show(vivid, "Gray Ramp")
+    show(vivid, "test_pattern", "Gray Ramp")
     lumas = {}
     for name in ("YUYV", "UYVY", "GREY"):
         with opened(vivid, standard="ntsc", pixel_format=name) as source:
@@ -114,7 +106,7 @@ def test_luma_is_the_same_in_every_pixel_format(vivid):
 @pytest.fixture
 def striped(vivid):
     """vivid with a picture whose top and bottom field differ."""
-    show(vivid, "Alternating Hor Lines")
+    show(vivid, "test_pattern", "Alternating Hor Lines")
     return vivid
 
 
@@ -268,6 +260,27 @@ def test_pixel_format_that_is_not_there(vivid):
     assert sentence.startswith(f"{vivid.node} (vivid) has no picture format MJPG, only ")
     assert "YUYV" in sentence
     assert sentence.endswith('; set v4l2.pixel_format = "auto"')
+
+
+def test_controls_are_set_and_read_back(vivid):
+    vivid.control("gain_automatic", 1)
+    with opened(vivid, brightness=100, hue=-5) as source:
+        facts = dict(source.info.facts)
+        assert (facts["brightness"], facts["hue"]) == ("100 of 0 to 255", "-5 of -128 to 128")
+        assert facts["automatic gain"] == "off"
+        assert "contrast" in facts
+        assert source.info.warnings == ()
+    said = run("v4l2-ctl", "-d", vivid.node, "--get-ctrl", "brightness,hue,gain_automatic")
+    assert said.split() == ["brightness:", "100", "hue:", "-5", "gain_automatic:", "0"]
+    vivid.control("gain_automatic", 1)
+    with opened(vivid, automatic="leave"):
+        assert "1" in run("v4l2-ctl", "-d", vivid.node, "--get-ctrl", "gain_automatic")
+
+
+def test_control_beyond_its_range(vivid):
+    assert refusal(vivid.node, brightness=300) == (
+        f"{vivid.node} (vivid) takes a brightness of 0 to 255; v4l2.brightness = 300 is beyond"
+    )
 
 
 def test_output_node_is_no_capture_device(vivid):

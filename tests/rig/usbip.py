@@ -14,7 +14,6 @@ from typing import NamedTuple
 _log = logging.getLogger(__name__)
 
 BUS_ID = "1-1"
-PORT = 3240
 
 _OPERATION = struct.Struct(">HHI")
 _REQUEST_IMPORT, _REPLY_IMPORT = 0x8003, 0x0003
@@ -101,6 +100,9 @@ class Device:
     def alternate_set(self, interface: int, alternate: int) -> None:
         """An interface was switched to one of its alternate settings."""
 
+    def configured(self) -> None:
+        """The device was configured: plugged in, or reset."""
+
     def due_s(self) -> float | None:
         """Return when `stream` has something to do next, None if never."""
         return None
@@ -119,7 +121,10 @@ class Device:
         match setup.request:
             case 0:  # GET_STATUS
                 return b"\0\0"
-            case 1 | 3 | 9:  # CLEAR_FEATURE, SET_FEATURE, SET_CONFIGURATION
+            case 1 | 3:  # CLEAR_FEATURE, SET_FEATURE
+                return b""
+            case 9:  # SET_CONFIGURATION
+                self.configured()
                 return b""
             case 6:  # GET_DESCRIPTOR
                 return self._descriptor(setup.value >> 8, setup.value & 0xFF)
@@ -165,9 +170,9 @@ def isochronous_packets(count: int, packet_bytes: int) -> bytes:
     )
 
 
-def serve(device: Device) -> None:
+def serve(device: Device, port: int) -> None:
     """Wait to be attached, be the device until it is detached, and again, for ever."""
-    with socket.create_server(("127.0.0.1", PORT)) as listener:
+    with socket.create_server(("127.0.0.1", port)) as listener:
         _log.info("listening")
         while True:
             connection, _ = listener.accept()

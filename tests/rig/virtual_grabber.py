@@ -3,7 +3,9 @@
     PYTHONPATH=tests python -m rig.virtual_grabber usbtv|uvc FRAMES.yuyv --serial S --control DIR
 
 `usbip attach -r 127.0.0.1 -b 1-1` plugs it in, `usbip detach -p 0` pulls it out. It shows the
-marker at rest while DIR/hold exists, else moving; while DIR/stall exists it sends nothing.
+marker at rest while DIR/hold exists, else moving; while DIR/blank exists, what a grabber shows
+without a camera; while DIR/stall exists it sends nothing, and while DIR/wedge does neither, but a
+reset of the device takes that away.
 """
 
 import argparse
@@ -16,6 +18,8 @@ from rig import frames
 from rig.usbip import Device, Pace, Setup, Stall, isochronous_packets, serve
 
 FRAME_PERIOD_S = 1001 / 30000
+BLANK = -1
+"""Number of the frame without a picture: the one after the last."""
 
 
 class Camera:
@@ -23,12 +27,19 @@ class Camera:
 
     def __init__(self, control: Path):
         self._film = frames.Film()
-        self._hold, self._stall = control / "hold", control / "stall"
+        self._hold, self._blank = control / "hold", control / "blank"
+        self._stall, self._wedge = control / "stall", control / "wedge"
 
     def next(self) -> int | None:
         """Return the number of the next frame, None when nothing is sent."""
         number = self._film.next(self._hold.exists())
-        return None if self._stall.exists() else number
+        if self._stall.exists() or self._wedge.exists():
+            return None
+        return BLANK if self._blank.exists() else number
+
+    def configured(self) -> None:
+        """The device was plugged in or reset."""
+        self._wedge.unlink(missing_ok=True)
 
 
 class Usbtv(Device):
@@ -50,7 +61,10 @@ class Usbtv(Device):
 
     def __init__(self, serial: str, pictures: np.ndarray, control: Path):
         super().__init__(serial)
-        self._fields = [self._chunks(p, odd) for p in pictures for odd in (0, 1)]
+        blank = np.full_like(pictures[:1], 128)
+        blank[..., 0] = 16
+        shown = np.concatenate([pictures, blank])
+        self._fields = [self._chunks(p, odd) for p in shown for odd in (0, 1)]
         self._camera = Camera(control)
         self._pace = Pace(FRAME_PERIOD_S / 2)
         self._unsent: list[bytes] = []
@@ -72,6 +86,9 @@ class Usbtv(Device):
 
     def own_request(self, setup: Setup) -> bytes:
         return bytes(setup.length)  # A register: takes every value, reads as 0.
+
+    def configured(self) -> None:
+        self._camera.configured()
 
     def alternate_set(self, interface: int, alternate: int) -> None:
         self._unsent.clear()
@@ -126,6 +143,7 @@ class Uvc(Device):
     def __init__(self, serial: str, pictures: np.ndarray, control: Path):
         super().__init__(serial)
         self._pictures = [picture.tobytes() for picture in pictures]
+        self._pictures.append(b"\x10\x80" * (frames.FRAME_BYTES // 2))
         self._camera = Camera(control)
         self._pace = Pace(FRAME_PERIOD_S)
         self._frame_id = 0
@@ -220,10 +238,12 @@ def main() -> None:
     parser.add_argument("frames", type=Path)
     parser.add_argument("--serial", required=True)
     parser.add_argument("--control", type=Path, required=True)
+    parser.add_argument("--tcp-port", type=int, default=3240)
     options = parser.parse_args()
     logging.basicConfig(level=logging.INFO)
     kind = {"usbtv": Usbtv, "uvc": Uvc}[options.kind]
-    serve(kind(options.serial, frames.load(options.frames), options.control))
+    device = kind(options.serial, frames.load(options.frames), options.control)
+    serve(device, options.tcp_port)
 
 
 if __name__ == "__main__":
