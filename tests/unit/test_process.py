@@ -111,6 +111,14 @@ def test_a_covered_marker_is_a_sample_without_a_position() -> None:
     assert run.feed(run.image(2.0)).x_mm == pytest.approx(2.0, abs=0.06)
 
 
+@pytest.mark.parametrize("grey", [0, 255])
+def test_a_picture_of_one_grey_has_no_position(grey: int) -> None:
+    run = Run().reference()
+    sample = run.feed(np.full((480, 720), grey, np.uint8))
+    assert sample.status & Status.NOT_FOUND
+    assert math.isnan(sample.x_mm)
+
+
 def test_one_covered_circle_leaves_a_flagged_position() -> None:
     run = Run().reference()
     image = run.image(4.0)

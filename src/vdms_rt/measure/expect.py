@@ -59,6 +59,8 @@ class Appearance:
     """Of the noise, its rounding to whole grey levels included."""
     edge_px: tuple[tuple[float, float], ...]
     """Widths (standard deviations) of the blurred edge along x and y, the pixel's own included."""
+    raster_scale: float = 1.0
+    """What the rows' raster does to this picture over what `raster` says of it."""
 
 
 class Expected(NamedTuple):
@@ -132,12 +134,13 @@ class Forecast:
         self._edge_px = float(np.mean(appearance.edge_px))
         self._rasters = [
             tuple(
-                raster(shape, edge, appearance.row_step, smeared)
+                _raster_pair(shape, edge, appearance.row_step, smeared)
                 for shape, edge in zip(appearance.moments_px2, appearance.edge_px, strict=True)
             )
             for smeared in ((False, True) if self._may_smear else (False,))
         ]
-        """For the usual weights and for those of smeared edges."""
+        """For the usual weights and for those of smeared edges: at rest, and of an ellipse that is
+        higher by a quarter of the rows' period."""
         self._spread = tuple(
             spread_px2(shape, edge, appearance.row_step)
             for shape, edge in zip(appearance.moments_px2, appearance.edge_px, strict=True)
@@ -225,9 +228,20 @@ class Forecast:
                     a10 * a10 * xx + 2 * a10 * a11 * xy + a11 * a11 * yy + wy + gain_yy,
                 )
             )
-            flat = math.exp(-((math.pi * way_y / seen.row_step) ** 2) / 12)
-            y_px, area, yy_px2 = self._rasters[smeared][k]
-            rasters.append(Raster(y_px * flat, area * flat, yy_px2 * flat))
+            flat = seen.raster_scale * math.exp(-((math.pi * way_y / seen.row_step) ** 2) / 12)
+            # The pull goes round with the height of the circle: its upper and its lower edge meet
+            # the rows alike or not.
+            height = a10 * a10 * xx + 2 * a10 * a11 * xy + a11 * a11 * yy
+            turn_px = 4 * math.pi * (math.sqrt(height) - math.sqrt(yy)) / seen.row_step
+            rest, quarter = flat * math.cos(turn_px), flat * math.sin(turn_px)
+            (y0, area0, yy0), (y1, area1, yy1) = self._rasters[smeared][k]
+            rasters.append(
+                Raster(
+                    rest * y0 + quarter * y1,
+                    rest * area0 + quarter * area1,
+                    rest * yy0 + quarter * yy1,
+                )
+            )
             spreads.append(blur.spread_px2)
             blurs.append((way_x, way_y))
             longest = max(longest, math.hypot(way_x, way_y) / self._edge_px)
@@ -349,6 +363,16 @@ def first_look(
         False,
         (0.0,) * n,
         tuple((a + EDGE_PX, b + EDGE_PX) for a, b in semi_axes_px),
+    )
+
+
+def _raster_pair(
+    shape: Shape, edge_px: tuple[float, float], row_step: int, smeared: bool
+) -> tuple[Raster, Raster]:
+    xx, xy, yy = shape
+    higher = (math.sqrt(yy) + row_step / 8) ** 2
+    return raster(shape, edge_px, row_step, smeared), raster(
+        (xx, xy, higher), edge_px, row_step, smeared
     )
 
 

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 LEAST_CIRCLES = 3
 """Two circles fix x, y and rotation, and would hide a wrong one; the third can contradict."""
 
+HARDLY = (2.6, 2.2)
+"""Quantile 0.95 of chi-square over its degrees of freedom, for three circles (3) and for four (5);
+more of them lie below."""
 BIRGE_LIMIT = (5.4, 4.1)
-"""Quantile 0.999 of chi-square over its degrees of freedom, for three circles (3) and for four
-(5); more of them lie below."""
+"""Quantile 0.999."""
 
 Point = tuple[float, float]
 Spread = tuple[float, float, float]
@@ -158,15 +160,17 @@ def position_covariance(
 
     `reference_covariance_mm2` is that of the circles' reference positions as the current picture
     sees them: their errors carry over to every later sample just as a picture's own do. Where the
-    circles disagree by more than noise does, in one picture of a thousand, something else is at
-    work on them, and their covariances count for as much more (Birge 1932).
+    circles disagree by more than noise does in one picture of a thousand, something else is at
+    work on them, and their covariances count for as much more (Birge 1932); from one picture in
+    twenty on, for what they exceed that limit.
     """
     arms = _arms(reference_mm)
     used = [k for k, usable in enumerate(motion.used) if usable]
     weights = [_inverse(reference_covariance_mm2[k]) for k in used]
     own_xx, own_xy, _, own_yy, _, _ = motion.covariance
     xx, xy, _, yy, _, _ = _covariance([arms[k] for k in used], weights)
-    more = motion.chi2 if motion.chi2 > BIRGE_LIMIT[len(used) > LEAST_CIRCLES] else 1.0
+    four = len(used) > LEAST_CIRCLES
+    more = motion.chi2 if motion.chi2 > BIRGE_LIMIT[four] else max(1.0, motion.chi2 / HARDLY[four])
     return more * own_xx + xx, more * own_xy + xy, more * own_yy + yy
 
 

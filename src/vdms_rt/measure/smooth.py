@@ -18,8 +18,8 @@ EFFICIENCY = 1.03
 """Standard deviation of this centroid over the Cramer-Rao bound, for the whole bench."""
 EDGE_REACH_PX = 2.2
 """Of the blurred edge beside its middle, with what the rounding to whole pixels adds."""
-RASTER_SHARE = 0.05
-"""How far the raster's pull is known: its model takes the edge as a Gaussian's."""
+RASTER_SHARE = 0.02
+"""How far the raster's pull is known."""
 MAX_PASSES = 12
 REFRESH_PICTURES = 32
 """Every so many pictures one circle's slow figures are measured anew."""
@@ -193,6 +193,8 @@ def _read(
             wave = wave_y * sin(phase - _TURN * wave / row_step)
         crest = cos(phase)
         contrast = disc - ground
+        # A disc that is quite black has no light to slope.
+        full = disc or math.inf
         part = variance_part / (contrast * contrast + 1e-6)
         readings.append(
             _new(
@@ -204,7 +206,7 @@ def _read(
                     (mxx / area - dx * dx, xy, yy - wave_yy * crest),
                     disc,
                     ground,
-                    (slope_x / disc, slope_y / disc),
+                    (slope_x / full, slope_y / full),
                     (sxx * part, sxy * part, syy * part + raster_part * wave_y * wave_y),
                 ),
             )
