@@ -258,7 +258,8 @@ def run(load: str, minutes: float, folder: Path, fifo: bool) -> dict[str, list[f
 
 def table(stamps: dict[str, Stamps]) -> dict[str, list[float]]:
     frames = stamps["station"]
-    since_ns = frames[0, 2] + SETTLE_S * 1e9
+    # The bare reader starts last.
+    since_ns = stamps["bare_reader"][0, 1] + SETTLE_S * 1e9
     said = {int(seq): (hand, taken, done) for seq, _, hand, done, taken in frames}
     came = [(*said[int(seq)], at) for seq, at in stamps["reader"] if said[int(seq)][0] > since_ns]
     hand, taken, done, at = np.array(came, dtype=np.int64).T
