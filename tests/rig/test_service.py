@@ -151,6 +151,8 @@ def test_a_wrong_configuration_is_one_line_and_no_restart(installed: str) -> Non
 
 
 def test_an_upgrade_keeps_the_configuration_and_restarts(installed: str) -> None:
+    # Corrected, it starts.
+    run("systemctl", "start", "vdms-rt")
     CONFIG.write_text(CONFIG.read_text().replace('name = "station"', 'name = "tower"'))
     said = service.make("install")
     assert f"{CONFIG} stays as it is" in said
