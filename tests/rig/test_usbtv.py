@@ -62,10 +62,10 @@ def test_standard_is_assumed_and_pal_is_accepted(usbtv):
 
 def test_what_its_controls_cannot_do_is_said(usbtv):
     usbtv.plug()
-    with opened(brightness=400) as source:
-        facts, (warning,) = dict(source.info.facts), source.info.warnings
-        assert facts["brightness"] == "400 of 0 to 1023"
-    assert warning.endswith(
+    with opened() as source:
+        warnings = source.info.warnings
+    assert len(warnings) == 1
+    assert warnings[0].endswith(
         "has no switch for automatic gain or exposure; switch them off at the camera, and keep the "
         "light steady while it measures"
     )

@@ -346,8 +346,6 @@ def test_devices_of_the_computer(vivid):
     assert not output.usable
     assert choose_device("auto").node == vivid.node
     table = devices_table(look_through([capture, output])).splitlines()
-    assert "signal now  ntsc-m, none: the picture is a test card" in [
-        line.replace("pal,", "ntsc-m,") for line in table
-    ]
+    assert "signal now  none: the picture is a test card" in table
     assert f'device =    "{vivid.node}"' in table
     assert f"Of no use: {vivid.output_node} (vivid) is not a capture device." in table

@@ -217,14 +217,15 @@ def test_times_of_the_fields(scene, field, order, first):
     assert {f.scan for f in fields if f.seq % 2 == 0} == {first}
     assert (np.diff([f.seq for f in fields]) > 0).all()
     # With no exposure a field was when it ended less its own duration. The stamp is of the end of
-    # the frame, and so of the later field; of fields that come one by one, each has its own. The
-    # clock settles in the first images, and the machine may hold single ones up: the median counts.
+    # the frame, and so of the later field; of fields that come one by one, each has its own. A busy
+    # machine stamps late by some milliseconds, never early: the least age counts. Another convention
+    # would be off by a quarter of a period, 8 ms.
     ages_ns = np.array([f.stamp_ns - f.t_ns for f in fields])
     odd = np.array([f.seq % 2 for f in fields], bool)
     early_ns = period_ns / 2 if field == api.FIELD_ALTERNATE else period_ns
-    assert np.median(ages_ns[~odd][-10:]) == pytest.approx(early_ns, abs=0.5e6)
-    assert np.median(ages_ns[odd][-10:]) == pytest.approx(period_ns / 2, abs=0.5e6)
+    assert ages_ns[~odd].min() == pytest.approx(early_ns, abs=4e6)
+    assert ages_ns[odd].min() == pytest.approx(period_ns / 2, abs=4e6)
     # Half a period lies between the fields, in any arrangement.
     by_seq = {f.seq: f.t_ns for f in fields}
     steps_ns = [by_seq[n + 1] - t for n, t in by_seq.items() if n + 1 in by_seq]
-    assert np.median(steps_ns) == pytest.approx(period_ns / 2, abs=0.2e6)
+    assert np.median(steps_ns) == pytest.approx(period_ns / 2, abs=1e6)
