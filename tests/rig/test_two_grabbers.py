@@ -18,7 +18,7 @@ def other(tmp_path):
     """A second emulated EasyCAP, plugged in."""
     grabber = Grabber("usbtv", "EASY02", tmp_path, tcp_port=3241)
     yield grabber
-    grabber.unplug()
+    grabber.reset()
     grabber.close()
 
 

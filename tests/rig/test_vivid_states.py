@@ -218,8 +218,8 @@ def test_times_of_the_fields(scene, field, order, first):
     assert (np.diff([f.seq for f in fields]) > 0).all()
     # With no exposure a field was when it ended less its own duration. The stamp is of the end of
     # the frame, and so of the later field; of fields that come one by one, each has its own. A busy
-    # machine stamps late by some milliseconds, never early: the least age counts. Another convention
-    # would be off by a quarter of a period, 8 ms.
+    # machine stamps late by some milliseconds, never early: the least age counts. Another
+    # convention would be off by a quarter of a period, 8 ms.
     ages_ns = np.array([f.stamp_ns - f.t_ns for f in fields])
     odd = np.array([f.seq % 2 for f in fields], bool)
     early_ns = period_ns / 2 if field == api.FIELD_ALTERNATE else period_ns
