@@ -6,6 +6,7 @@ ifeq ($(origin SECONDS),environment)
 SECONDS := 0
 endif
 PYTHON ?= python3
+PORT ?= 8080
 VENV := .venv
 BIN := $(VENV)/bin
 
@@ -36,8 +37,11 @@ $(VENV)/replay.stamp: requirements/replay.txt tools/replay/pyproject.toml $(VENV
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable tools/replay
 	@touch $@
 
-demo: $(VENV)/run.stamp ## measure the virtual shaking table (SECONDS=10 ends by itself)
-	@$(BIN)/vdms-rt run --config config/demo.toml --seconds $(SECONDS)
+demo: $(VENV)/run.stamp ## measure the virtual shaking table, with its page (SECONDS=10 ends by itself; PORT=8080)
+	@echo "the page: http://127.0.0.1:$(PORT)/"
+	@$(BIN)/vdms-rt view --port $(PORT) >/dev/null & view=$$!; \
+	trap 'kill $$view 2>/dev/null; wait $$view' EXIT; trap : INT TERM; \
+	$(BIN)/vdms-rt run --config config/demo.toml --seconds $(SECONDS)
 
 check: $(VENV)/replay.stamp ## format, lint, types, layers
 	@$(BIN)/ruff format --check --quiet . || { $(BIN)/ruff format --diff --quiet .; exit 1; }

@@ -159,11 +159,13 @@ export class Look {
 
   draw_spectrum() {
     const axis = byId("spectrum-axis").value;
-    const from_s = this.paused ? this.from_s : Math.min(this.from_s, this.to_s - LEAST_SPECTRUM_S);
+    const from_s = Math.min(this.from_s, this.to_s - LEAST_SPECTRUM_S);
     const found = spectrum(this.store.between("t_s", from_s, this.to_s), this.store.between(axis, from_s, this.to_s), this.store.period_s());
     this.peaks = found ? peaks(found, 3) : [];
-    byId("spectrum").style.visibility = found ? "visible" : "hidden";
-    if (found) this.spectrum_plot.setData([found.hz.subarray(1), found.amplitude.subarray(1)]);
+    // Without any motion, as of a fixed marker, there is nothing to put on a logarithmic scale.
+    const moves = found?.amplitude.some((a) => a > 0);
+    byId("spectrum").style.visibility = moves ? "visible" : "hidden";
+    if (moves) this.spectrum_plot.setData([found.hz.subarray(1), found.amplitude.subarray(1)]);
     const list = byId("peaks");
     const told = found ? (this.peaks.length ? this.peaks.map((p) => `${p.hz.toFixed(3)} Hz  ${length(p.amplitude)}`) : ["no peak stands out"]) : ["too few samples for a spectrum yet"];
     if ([...list.children].map((li) => li.textContent).join() !== told.join()) list.replaceChildren(...told.map((text) => element("li", { textContent: text })));

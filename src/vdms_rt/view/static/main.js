@@ -88,9 +88,9 @@ function show_station() {
     ["rate", `${plain(health.frame_rate_hz, 2)} frames/s, ${plain(store.rate_hz(), 2)} samples/s`],
     ["lost", `${lost} frames, ${health.invalid} invalid samples`, lost ? "warn" : ""],
     ["this page", page.skipped ? `skipped ${page.skipped}` : marker?.on_the_way ? `${marker.on_the_way} samples lost on the way` : "has every sample", page.skipped || marker?.on_the_way ? "warn" : ""],
-    ["recording", health.record_trouble || health.recording.split("/").pop() || "no", health.record_trouble ? "bad" : ""],
+    ["recording", health.record_trouble || health.recording.split("/").pop().replace(/\.mcap(\.part)?$/, "") || "no", health.record_trouble ? "bad" : ""],
     ["disk left", bytes(health.disk_free_bytes), health.disk_free_bytes < 5e9 ? "warn" : ""],
-    ["clock", `UTC ${health.utc_state}, frames ± ${plain(health.clock_sigma_us, 0)} µs`],
+    ["clock", `UTC ${health.utc_state}, ± ${plain(health.clock_sigma_us, 0)} µs`],
     ["age", `${plain(health.sample_age_ms, 0)} ms from light to number`],
     ["device", health.device],
   ]);

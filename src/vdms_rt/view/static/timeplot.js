@@ -53,7 +53,7 @@ export class TimePlot {
       width: 400, height: 120, padding: [8, 6, 0, 0], legend: none, pxAlign: 0,
       scales: { x: { time: true, range: () => [view.from_s, view.to_s] }, y: { range: () => this.range } },
       axes: [
-        { stroke: ink, grid, ticks: grid, size: 26, space: 90, values: (u, at, _, __, step) => at.map((s) => clock(s, step < 1 ? (step < 0.1 ? 2 : 1) : 0)) },
+        { stroke: ink, grid, ticks: grid, size: 26, space: 90, values: (u, at, _, __, step) => at.map((s) => clock(s, clock_digits(step))) },
         { stroke: ink, grid, ticks: grid, size: 68, space: 26, values: (u, at) => at.map((v) => v.toFixed(decimals(this.range))) },
       ],
       series: [
@@ -119,6 +119,11 @@ export class TimePlot {
     });
     over.addEventListener("pointerup", () => { last_px = null; });
   }
+}
+
+/** Digits of a second that tell times of such a step apart. */
+function clock_digits(step_s) {
+  return [0, 1, 2].find((digits) => Math.abs(step_s * 10 ** digits - Math.round(step_s * 10 ** digits)) < 1e-6) ?? 3;
 }
 
 function decimals([low, high]) {
