@@ -55,8 +55,11 @@ class Told:
             return next(event for event in self.events if event.code == code)
 
 
-def recorder_for(directory: Path, *, live: bool = True, **settings: Any) -> tuple[Recorder, Told]:
-    """Return a recorder whose thread does not run yet."""
+def recorder_for(
+    directory: Path, *, live: bool = True, passing: bool = False, **settings: Any
+) -> tuple[Recorder, Told]:
+    """Return a recorder whose thread does not run yet. It takes pixels while there is any room."""
+    settings = {"free_mb": 0} | settings
     told = Told()
     recorder = Recorder(
         Record(directory=str(directory), **settings),
@@ -73,6 +76,7 @@ def recorder_for(directory: Path, *, live: bool = True, **settings: Any) -> tupl
             session=SESSION, reason=reason, health=pb.Health(captured=7)
         ).SerializeToString(),
         told,
+        passing=passing,
     )
     told.recorder = recorder
     return recorder, told

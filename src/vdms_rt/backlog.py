@@ -6,6 +6,7 @@ import threading
 from collections import deque
 
 from vdms_rt.logfile.writer import LogAttachment, LogMessage
+from vdms_rt.wire import topics
 from vdms_rt.wire import vdms_pb2 as pb
 from vdms_rt.wire.topics import Topic
 
@@ -18,6 +19,8 @@ PIXELS_SHARE = 0.75
 RESERVE_MESSAGES = 64
 """Beyond the limit, for the rare messages that explain a file: events and set-ups."""
 RANGES_TOLD = 20
+SPARED = (topics.PIXELS, topics.CHECKPOINT)
+"""What is left out when the disk has little room."""
 
 
 class Backlog:
@@ -33,6 +36,8 @@ class Backlog:
         self._bytes = 0
         self._sequences: dict[str, int] = {}
         self._lost: dict[str, _Lost] = {}
+        self._spared: dict[str, _Lost] = {}
+        self._sparing = False
         self._lost_messages = 0
         self._waiting_allowed = not live
         self._paused = False
@@ -60,6 +65,9 @@ class Backlog:
             message = LogMessage(
                 key, topic.message, sequence & 0xFFFFFFFF, log_time_ns, log_time_ns, data
             )
+            if self._sparing and not self._ended and topic in SPARED:
+                self._lose(message, self._spared)
+                return False
             if not self._has_room(message) and self._may_wait():
                 self._ready.notify()
                 self._room.wait_for(lambda: self._has_room(message) or not self._may_wait(), WAIT_S)
@@ -84,6 +92,7 @@ class Backlog:
         """Take nothing more, except from the record thread itself."""
         with self._lock:
             self._ended = True
+            self._tell_spared()
             self._ready.notify()
             self._room.notify_all()
 
@@ -98,6 +107,13 @@ class Backlog:
         with self._lock:
             self._paused = paused
             self._room.notify_all()
+
+    def spare(self, sparing: bool) -> None:
+        """Take no more pixels, or take them again; then `take_lost` tells which are missing."""
+        with self._lock:
+            self._sparing = sparing
+            if not sparing:
+                self._tell_spared()
 
     def wait_ready(self, timeout_s: float) -> None:
         """Return when a batch is there, when `end` was called, or after `timeout_s`."""
@@ -135,6 +151,7 @@ class Backlog:
     def lose_all(self) -> None:
         """Count what is queued as lost."""
         with self._lock:
+            self._tell_spared()
             for item in self._items:
                 if isinstance(item, LogMessage):
                     self._lose(item)
@@ -177,9 +194,16 @@ class Backlog:
             and threading.get_ident() != self._reader
         )
 
-    def _lose(self, message: LogMessage) -> None:
+    def _lose(self, message: LogMessage, among: dict[str, _Lost] | None = None) -> None:
         self._lost_messages += 1
-        self._lost.setdefault(message.key, _Lost(message.type is pb.Displacement)).add(message)
+        lost = self._lost if among is None else among
+        lost.setdefault(message.key, _Lost(message.type is pb.Displacement)).add(message)
+
+    def _tell_spared(self) -> None:
+        """What was spared is lost; told at once, it would be told every second for days."""
+        for key, spared in self._spared.items():
+            self._lost.setdefault(key, _Lost(samples=False)).join(spared)
+        self._spared = {}
 
 
 class _Lost:
@@ -195,10 +219,18 @@ class _Lost:
         if self._samples:
             number = pb.Displacement.FromString(message.data).seq
         self._count += 1
-        if self._ranges and self._ranges[-1][1] + 1 == number:
-            self._ranges[-1][1] = number
+        self._add_range(number, number)
+
+    def join(self, later: _Lost) -> None:
+        self._count += later._count
+        for first, last in later._ranges:
+            self._add_range(first, last)
+
+    def _add_range(self, first: int, last: int) -> None:
+        if self._ranges and self._ranges[-1][1] + 1 == first:
+            self._ranges[-1][1] = last
         else:
-            self._ranges.append([number, number])
+            self._ranges.append([first, last])
 
     def text(self) -> str:
         told = [f"{a}-{b}" if b > a else f"{a}" for a, b in self._ranges[:RANGES_TOLD]]

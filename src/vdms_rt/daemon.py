@@ -137,6 +137,7 @@ class Daemon:
             self._run_header,
             self._run_end,
             self._outlet.event,
+            passing=self.config.source == "v4l2",
         )
         self._notifier.busy(REPAIR_S)
         for repaired in repair_directory(Path(record.directory).expanduser()):

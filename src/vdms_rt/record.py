@@ -6,8 +6,6 @@ thread, the only one that touches the disk.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import tempfile
 import threading
 import time
@@ -17,6 +15,8 @@ from pathlib import Path
 
 from vdms_rt.backlog import Backlog
 from vdms_rt.config import Record
+from vdms_rt.logfile.shelf import Shelf
+from vdms_rt.logfile.thin import ABOUT, KEEP_PIXELS
 from vdms_rt.logfile.writer import LogAttachment, LogMessage, LogWriter
 from vdms_rt.model import Event, Severity, VdmsError
 from vdms_rt.wire import topics
@@ -24,8 +24,12 @@ from vdms_rt.wire import vdms_pb2 as pb
 from vdms_rt.wire.topics import Topic
 
 POLL_S = 0.05
+SLOW_MS = 1000.0
+"""A flush that takes longer is told."""
 RETRY_S = 1.0
 TELL_LOST_S = 1.0
+HEADS = (topics.SETUP.message, topics.PICTURE.message)
+"""Of these the newest stands at the head of each file, so that it can be read alone."""
 
 
 class RecordError(VdmsError):
@@ -42,7 +46,7 @@ class RecordCounters:
     """Messages that are in no file and never will be."""
     queued: int
     fsync_ms: float
-    """The slowest flush to disk since the counters were last asked for."""
+    """The slowest flush to disk since the counters were last asked for, one under way included."""
     disk_free_bytes: int
     file: str
     """Path of the file being written (without its .part), or of the last one; empty before."""
@@ -66,18 +70,22 @@ class Recorder:
         run_header: Callable[[], bytes],
         run_end: Callable[[str], bytes],
         report: Callable[[Event], None],
+        *,
+        passing: bool = False,
     ) -> None:
         """Make sure that the directory can be written; raises RecordError with a sentence.
 
         `run_header` gives a serialised `vdms.Run` for the start of each file, `run_end(reason)` a
         `vdms.End` for its end, and `report` passes an event on, also back to `put` before it
-        returns. All three are called by the record thread.
+        returns. All three are called by the record thread. `passing` says that outside of the runs
+        that somebody starts only the newest pixels are kept.
         """
         self._config = config
         self._station = station
         self._run_header = run_header
         self._run_end = run_end
         self._report = report
+        self._passing = passing
         self._directory = Path(config.directory).expanduser().absolute()
         self._run = ""
         self._name = self._file_name()
@@ -88,7 +96,7 @@ class Recorder:
         self._end_reason: str | None = None
         self._recorded = 0
         self._fsync_ms = 0.0
-        self._disk_free_bytes = 0
+        self._flushing_since_s: float | None = None
         self._files: list[str] = []
         self._trouble = ""
 
@@ -100,9 +108,10 @@ class Recorder:
         self._sync_due_s = 0.0
         self._retry_due_s = 0.0
         self._tell_lost_due_s = 0.0
-        self._set_ups: dict[str, LogMessage] = {}
+        self._heads: dict[str, LogMessage] = {}
         self._attachments: dict[str, LogAttachment] = {}
         self._probe_directory()
+        self._shelf = Shelf(self._directory, station, config)
 
     def put(self, topic: Topic, key: str, log_time_ns: int, data: bytes) -> bool:
         """Queue a serialised message; False if it was dropped, which is counted and remembered.
@@ -148,12 +157,14 @@ class Recorder:
     def counters(self) -> RecordCounters:
         """Return the counters; the slowest flush is sought anew from here."""
         with self._lock:
+            since_s = self._flushing_since_s
+            under_way_ms = 0.0 if since_s is None else (time.monotonic() - since_s) * 1e3
             counters = RecordCounters(
                 recorded=self._recorded,
                 not_recorded=self._backlog.lost_messages,
                 queued=len(self._backlog),
-                fsync_ms=self._fsync_ms,
-                disk_free_bytes=self._disk_free_bytes,
+                fsync_ms=max(self._fsync_ms, under_way_ms),
+                disk_free_bytes=self._shelf.free_bytes,
                 file=self._files[-1] if self._files else "",
                 trouble=self._trouble,
             )
@@ -175,6 +186,7 @@ class Recorder:
         failed_at_end = 0
         self._backlog.claim()
         try:
+            self._look_after()
             while self._wait():
                 try:
                     self._work()
@@ -184,7 +196,9 @@ class Recorder:
                     if failed_at_end > 1:
                         break
                 self._tell_lost()
+                self._look_after()
         finally:
+            self._shelf.close()
             self._backlog.end()
             self._give_up()
 
@@ -228,8 +242,8 @@ class Recorder:
             self._attachments[item.name] = item
             log.attach(item, self._log_time_ns)
             return
-        if item.type is pb.SetUp:
-            self._set_ups[item.key] = item
+        if item.type in HEADS:
+            self._heads[item.key] = item
         self._log_time_ns = max(self._log_time_ns, item.log_time_ns)
         log.add(item)
         self._unsynced.append(item)
@@ -241,17 +255,25 @@ class Recorder:
 
     def _timed(self, to_disk: Callable[[], None]) -> None:
         started_s = time.monotonic()
+        with self._lock:
+            self._flushing_since_s = started_s
         try:
             to_disk()
         finally:
             took_ms = (time.monotonic() - started_s) * 1e3
             with self._lock:
+                self._flushing_since_s = None
                 self._fsync_ms = max(self._fsync_ms, took_ms)
         with self._lock:
             self._recorded += len(self._unsynced)
             self._unsynced.clear()
-            with contextlib.suppress(OSError):
-                self._disk_free_bytes = _free_bytes(self._directory)
+        if took_ms >= SLOW_MS and not self._ending:
+            waiting, limit = len(self._backlog), self._config.queue_messages
+            text = (
+                f"the disk took {took_ms / 1e3:.1f} s to store what was recorded: {waiting} "
+                f"messages wait now, and nothing is lost up to {limit} (record.queue_messages)"
+            )
+            self._tell(Severity.WARNING, "slow-disk", text)
 
     def _full(self, log: LogWriter) -> str:
         """Return why what comes next belongs into the next file, or nothing."""
@@ -272,12 +294,12 @@ class Recorder:
         log = self._create()
         self._log_time_ns = self._backlog.first_log_time_ns(self._log_time_ns)
         header = self._run_header()
-        log.add_metadata("vdms", self._metadata(header))
+        log.add_metadata(ABOUT, self._metadata(header))
         for attachment in self._attachments.values():
             log.attach(attachment, self._log_time_ns)
         log.add(self._own(topics.RUN, header))
-        for set_up in self._set_ups.values():
-            log.add(replace(set_up, log_time_ns=self._log_time_ns))
+        for head in self._heads.values():
+            log.add(replace(head, log_time_ns=self._log_time_ns))
         self._part_opened_s = time.monotonic()
         self._sync_due_s = 0.0
         with self._lock:
@@ -310,6 +332,7 @@ class Recorder:
             "session": f"{run.session:016x}",
             "run": self._run,
             "part": str(self._part),
+            KEEP_PIXELS: "newest" if self._passing and not self._run else "always",
         }
 
     def _own(self, topic: Topic, data: bytes) -> LogMessage:
@@ -330,7 +353,7 @@ class Recorder:
         if self._log is not None and self._log.broken:
             self._log.abandon()
             self._log = None
-            in_head = [id(set_up) for set_up in self._set_ups.values()]
+            in_head = [id(head) for head in self._heads.values()]
             self._backlog.put_back([m for m in self._unsynced if id(m) not in in_head])
             self._unsynced.clear()
         where = error.filename or (self._log.part_path if self._log else self._directory)
@@ -375,6 +398,16 @@ class Recorder:
             what = "; ".join(f"{text} of {key}" for key, text in lost)
             self._tell(Severity.WARNING, "not-recorded", f"not recorded: {what}", *lost)
 
+    def _look_after(self) -> None:
+        """See to the room on the disk; not at the end, when no file comes that could say it."""
+        if self._ending:
+            return
+        log = self._log
+        notices = self._shelf.turn(log.path if log else None, log.length if log else 0)
+        self._backlog.spare(self._shelf.tight)
+        for notice in notices:
+            self._tell(notice.severity, notice.code, notice.text)
+
     def _tell(self, severity: Severity, code: str, text: str, *facts: tuple[str, str]) -> None:
         self._report(Event(severity, code, text, time.monotonic_ns(), time.time_ns(), facts))
 
@@ -383,7 +416,6 @@ class Recorder:
             self._directory.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self._directory):
                 pass
-            self._disk_free_bytes = _free_bytes(self._directory)
         except OSError as error:
             file = self._directory.is_file()
             raise RecordError(
@@ -395,8 +427,3 @@ class Recorder:
 
 def _reason(error: OSError) -> str:
     return (error.strerror or str(error)).lower()
-
-
-def _free_bytes(directory: Path) -> int:
-    free = os.statvfs(directory)
-    return free.f_bavail * free.f_frsize

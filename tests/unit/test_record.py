@@ -6,7 +6,6 @@ import errno
 import os
 import shutil
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -37,9 +36,9 @@ from vdms_rt.wire import vdms_pb2 as pb
 
 @pytest.fixture(autouse=True)
 def no_thread_survives():
-    before = threading.active_count()
+    before = set(threading.enumerate())
     yield
-    assert threading.active_count() == before
+    assert set(threading.enumerate()) <= before
 
 
 def set_up_bytes(revision):
@@ -296,7 +295,7 @@ def test_a_slow_disk_shows_and_loses_nothing(tmp_path, monkeypatch):
 
     def slow_fsync(fd):
         slow.set()
-        assert go_on.wait(30.0)
+        assert go_on.wait(60.0)
         fsync(fd)
 
     recorder, _ = recorder_for(tmp_path)
@@ -305,14 +304,13 @@ def test_a_slow_disk_shows_and_loses_nothing(tmp_path, monkeypatch):
         wait_until_recorded(recorder, 1)
         monkeypatch.setattr(os, "fsync", slow_fsync)
         put_sample(recorder, 1)
-        assert slow.wait(30.0)
-        started_s = time.monotonic()
+        assert slow.wait(60.0)
         assert all(put_sample(recorder, seq) for seq in range(2, 1000))
-        while time.monotonic() - started_s < 0.1:
+        while recorder.counters().fsync_ms < 100.0:  # it shows while it lasts
             threading.Event().wait(0.02)
         go_on.set()
     assert recorder.counters().fsync_ms >= 100.0
-    assert recorder.counters().fsync_ms == 0.0
+    assert recorder.counters().fsync_ms == 0.0  # the slowest is sought anew
     assert samples_in(files(tmp_path)[0]) == list(range(1000))
 
 

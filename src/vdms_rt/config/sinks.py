@@ -55,3 +55,9 @@ class Record(Section):
     rotate_mb: float = Field(default=2000.0, ge=1, le=1_000_000)
     sync_s: float = Field(default=0.5, gt=0, le=1)
     """Most that a pulled plug may cost."""
+    free_mb: float = Field(default=500.0, ge=0, le=1_000_000)
+    """With less room than this on the disk no pixels are recorded; 0: as long as there is any."""
+    newest_pixels_gb: float = Field(default=10.0, ge=0, le=1_000_000)
+    """Of the files with pixels that a grabber made outside of runs, the newest that keep them."""
+    keep_gb: float = Field(default=0.0, ge=0, le=1_000_000)
+    """With more recordings than this the oldest are removed; 0: never."""

@@ -11,7 +11,28 @@ from pathlib import Path
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-_NAME = re.compile(r"(?P<station>.+?)_(?P<utc>\d{8}T\d{6}Z)(?:_(?P<run>.+))?_\d{3,}\.mcap(\.part)?")
+_NAME = re.compile(
+    r"(?P<station>.+?)_(?P<utc>\d{8}T\d{6}Z)(?:_(?P<run>.+))?_(?P<part>\d{3,})\.mcap(\.part)?"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FileName:
+    """What the name of a recording tells."""
+
+    station: str
+    utc: str
+    """When the run began, as 20260131T235959Z."""
+    run: str
+    """That was started by name, or empty."""
+    part: int
+
+
+def parse_name(name: str) -> FileName | None:
+    """Return what a recording's file name tells, or None if it is not one's."""
+    if (named := _NAME.fullmatch(name)) is None:
+        return None
+    return FileName(named["station"], named["utc"], named["run"] or "", int(named["part"]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +56,9 @@ def list_recordings(directory: Path) -> list[Recording]:
     """
     recordings = []
     for path in sorted((*directory.glob("*.mcap"), *directory.glob("*.mcap.part"))):
-        if (named := _NAME.fullmatch(path.name)) is None:
+        if (named := parse_name(path.name)) is None:
             continue
-        begin_s = calendar.timegm(time.strptime(named["utc"], "%Y%m%dT%H%M%SZ"))
+        begin_s = calendar.timegm(time.strptime(named.utc, "%Y%m%dT%H%M%SZ"))
         try:
             about = path.stat()
             span_ns = None if path.suffix == ".part" else _span_ns(path)
@@ -47,7 +68,7 @@ def list_recordings(directory: Path) -> list[Recording]:
         recordings.append(
             Recording(
                 name=path.name.removesuffix(".part"),
-                run=named["run"] or "",
+                run=named.run,
                 begin_utc_ns=begin_ns,
                 length_s=max(end_ns - begin_ns, 0) / 1e9,
                 size_bytes=about.st_size,

@@ -117,7 +117,7 @@ def copy_readable(reader: LogReader, out: BinaryIO) -> int:
     Chunks are copied without unpacking, so that a file of gigabytes takes seconds. A metadata
     record `repair` says what was left out.
     """
-    copy = _Copy(out)
+    copy = Copy(out)
     for block in reader.blocks():
         copy.add(block)
     copy.metadata(
@@ -135,11 +135,12 @@ def copy_readable(reader: LogReader, out: BinaryIO) -> int:
     return sum(copy.counts.values())
 
 
-class _Copy:
-    """A complete MCAP made of the blocks of another one."""
+class Copy:
+    """A complete MCAP made of the blocks of another one, `without` the messages of some types."""
 
-    def __init__(self, out: BinaryIO) -> None:
+    def __init__(self, out: BinaryIO, without: frozenset[str] = frozenset()) -> None:
         self.counts: Counter[int] = Counter()
+        self._without = without
         self._out = out
         self._offset = 0
         self._schemas: dict[int, Schema] = {}
@@ -152,16 +153,18 @@ class _Copy:
         self._record(Header(profile="", library=f"vdms-rt {__version__}"))
 
     def add(self, block: Block) -> None:
-        messages = [r for r in block.records if isinstance(r, StoredMessage)]
+        stored = [r for r in block.records if isinstance(r, StoredMessage)]
+        messages = [m for m in stored if m.schema is None or m.schema.name not in self._without]
         for message in messages:
             self._define(message)
         if block.chunk is not None:
             if messages:
-                self._chunk(block, block.chunk, messages)
+                whole = not block.orphans and len(messages) == len(stored)
+                self._chunk(block.chunk if whole else None, messages)
             return
         for record in block.records:
             match record:
-                case StoredMessage():
+                case StoredMessage() if record in messages:
                     self._record(record.message)
                     self._count([record])
                 case Attachment():
@@ -179,9 +182,10 @@ class _Copy:
             self._channels[channel.id] = channel
             self._record(channel)
 
-    def _chunk(self, block: Block, chunk: Chunk, messages: list[StoredMessage]) -> None:
-        if block.orphans:
-            chunk, messages = _without_orphans(messages)
+    def _chunk(self, chunk: Chunk | None, messages: list[StoredMessage]) -> None:
+        """Write a chunk as it stands, or without one, make it of its messages."""
+        if chunk is None:
+            chunk, messages = _chunk_of(messages)
         times_ns = [stored.message.log_time for stored in messages]
         # No checksum covers these two in the file.
         chunk.message_start_time, chunk.message_end_time = min(times_ns), max(times_ns)
@@ -291,7 +295,7 @@ class _Copy:
         return len(data)
 
 
-def _without_orphans(messages: list[StoredMessage]) -> tuple[Chunk, list[StoredMessage]]:
+def _chunk_of(messages: list[StoredMessage]) -> tuple[Chunk, list[StoredMessage]]:
     """Return a chunk of these messages alone."""
     builder = RecordBuilder()
     moved = []
