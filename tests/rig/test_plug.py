@@ -8,6 +8,7 @@ import random
 import sys
 import threading
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -93,17 +94,20 @@ def test_pulled_and_plugged_in_while_it_measures(hands, tmp_path, capsys, times)
     assert len(between) == times + 1, told
     assert all("streaming" in states for states in between), told
     measured = [s for s in station.recorded("displacement") if s.valid]
-    # No sample has a position that the marker never had. Right after a pause a circle is not where
-    # it was expected, and a sample may be less exact: so the limit is wider than that of the most.
+    # No sample has a position that the marker never had.
     if hands.truth_known:
-        away = away_mm(measured)
-        assert np.median(away) < 0.005
-        assert away.max() < 0.2
+        sigma_mm = np.array([max(s.sigma_x_mm, s.sigma_y_mm) for s in measured])
+        assert (away_mm(measured) < np.maximum(0.02, 4 * sigma_mm)).all()
     else:
         positions = np.array([(s.x_mm, s.y_mm) for s in measured])
         assert np.abs(positions).max() < REST_MM
-    times_ns = np.array([s.t_ns for s in measured])
-    assert (np.diff(times_ns) > 0).all()
+    numbers = [s.seq for s in measured]
+    assert numbers == sorted(set(numbers))
+    # The times go on, as well as the clock says that it knows them: a busy machine holds frames up,
+    # and where it takes that back a new segment begins.
+    for before, after in pairwise(measured):
+        doubt_ns = 4 * (before.sigma_t_ns + after.sigma_t_ns)
+        assert after.t_ns > before.t_ns - doubt_ns or after.segment > before.segment
 
 
 @pytest.mark.hardware
