@@ -7,6 +7,7 @@
 #     -p           prepare this machine, and run nothing: packages and kernel
 #     -s           boot systemd, with udev and the journal; else nothing runs but the command
 #     -t SECONDS   limit for the whole run (600)
+#     -d IMAGE     a disk, /dev/vda in the guest, which keeps what reached it when the guest is reset
 #     -o DIR       host folder, writable in the guest as /mnt/out; console.log goes there too
 #
 # The command runs as root in the caller's working directory and with the caller's PATH. What it
@@ -22,6 +23,7 @@ cache=${VDMS_RIG_CACHE:-/var/cache/vdms-rig}
 accel=${VDMS_RIG_ACCEL:-tcg,thread=multi}
 limit_s=600
 out=
+disk=
 init=command
 only_prepare=
 while [ $# -gt 0 ]; do
@@ -29,6 +31,7 @@ while [ $# -gt 0 ]; do
         -p) only_prepare=yes; shift ;;
         -s) init=systemd; shift ;;
         -t) limit_s=$2; shift 2 ;;
+        -d) disk=$2; shift 2 ;;
         -o) out=$2; shift 2 ;;
         --) shift; break ;;
         -*) echo "rig: unknown option $1" >&2; exit 2 ;;
@@ -48,7 +51,7 @@ quietly() {
 prepare() {
     local missing=() package image
     for package in qemu-system-x86 kmod cpio busybox-static v4l-utils usbip udev \
-        systemd-sysv make python3-venv; do
+        systemd-sysv make python3-venv e2fsprogs; do
         dpkg-query -Wf '${db:Status-Status}' "$package" 2>/dev/null | grep -qx installed ||
             missing+=("$package")
     done
@@ -200,6 +203,10 @@ case $accel in tcg*)
     kernel_options="clearcpuid=112 tsc=reliable clocksource=tsc"
     ;;
 esac
+# What the emulator took is safe from a reset, so it need not wait for this machine's disk.
+disk_options=()
+[ -z "$disk" ] || disk_options=(-drive "file=$disk,if=none,id=disk,format=raw,cache=unsafe"
+    -device virtio-blk-pci,drive=disk)
 mkfifo "$work/output"
 cat "$work/output" &
 cat_pid=$!
@@ -211,7 +218,7 @@ qemu-system-x86_64 -accel "$accel" -cpu "$cpu" -M q35,sata=off,smbus=off,vmport=
     -fsdev local,id=host,path=/,security_model=none,readonly=on,multidevs=remap \
     -device virtio-9p-pci,fsdev=host,mount_tag=host \
     -fsdev local,id=out,path="$out",security_model=none,multidevs=remap \
-    -device virtio-9p-pci,fsdev=out,mount_tag=out \
+    -device virtio-9p-pci,fsdev=out,mount_tag=out "${disk_options[@]}" \
     -kernel "$cache/root/boot/vmlinuz-$version" -initrd "$work/initrd.gz" \
     -append "console=ttyS0 quiet loglevel=4 panic=-1 mitigations=off $kernel_options rig.modules=$cache/root/lib/modules/$version rig.init=$init systemd.unit=rig.target systemd.show_status=0" \
     </dev/null 2>"$out/qemu.log" &
