@@ -56,7 +56,10 @@ def test_a_killed_recording_is_repaired_and_read_by_others(tmp_path):
 
 
 @pytest.mark.slow
-def test_twenty_kills_lose_at_most_a_second_each(tmp_path):
-    chance = random.Random(8)
-    for number in range(20):
+@pytest.mark.parametrize(
+    "kills", [20, pytest.param(200, marks=[pytest.mark.soak, pytest.mark.timeout(3000)])]
+)
+def test_kills_lose_at_most_a_second_each(tmp_path, kills):
+    chance = random.Random(kills)
+    for number in range(kills):
         check_round(tmp_path / str(number), chance.uniform(0.05, 2.5))
