@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -82,7 +81,9 @@ def only_recording(directory: Path) -> Path:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.CompletedProcess[str], Path]:
     directory = tmp_path_factory.mktemp("demo")
-    done = run("run", "--config", table_config(directory), "--seconds", 9)
+    # Room for all frames of the run, lest a busy machine overwrites some.
+    config = table_config(directory, extra="[process]\nring_slots = 320")
+    done = run("run", "--config", config, "--seconds", 9)
     return done, only_recording(directory)
 
 
@@ -102,14 +103,20 @@ def test_every_frame_has_its_displacement(
     demo: tuple[subprocess.CompletedProcess[str], Path],
 ) -> None:
     samples = list(messages(demo[1], "displacement"))
-    assert len(samples) > 2 * 9 * 29
+    (end,) = messages(demo[1], "end")
+    # A busy machine comes too late for a frame, or has not measured the last ones when it stops;
+    # both is counted, and nothing else may be missing.
+    missed = end.health.missed
+    assert len(samples) == 2 * (end.health.captured - end.health.overwritten)
+    assert len(samples) > 300
     seqs = [s.seq for s in samples]
-    assert seqs == list(range(seqs[0], seqs[0] + len(seqs)))
+    assert seqs == sorted(set(seqs))
+    assert seqs[-1] + 1 - seqs[0] - len(seqs) <= 2 * missed
     flags = [bool(s.status & Status.SET_UP) for s in samples]
     first = flags.index(False)
     assert all(flags[:first])
     assert not any(flags[first:])
-    assert all(s.valid for s in samples[first:])
+    assert missed or all(s.valid for s in samples[first:])
     assert all(math.isnan(s.x_mm) and not s.valid for s in samples[:first])
     assert len({s.session for s in samples}) == 1
 
@@ -356,13 +363,17 @@ def test_a_second_signal_ends_at_once(tmp_path: Path) -> None:
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )
     assert process.stderr is not None
-    lines = iter(process.stderr)
-    for line in lines:
-        if "frames come" in line:
+    for line in process.stderr:
+        if "recording into" in line:
             break
+    # Both are there before it can do anything about the first.
+    process.send_signal(signal.SIGSTOP)
     process.send_signal(signal.SIGTERM)
-    hammer = threading.Event()
-    while process.poll() is None and not hammer.wait(0.02):
-        process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGCONT)
+    rest = process.stderr.read()
+    assert process.wait(DEADLINE_S) == 1
+    assert rest.endswith("vdms-rt: forced to end\n")
     process.stderr.close()
-    assert process.wait(DEADLINE_S) in (0, 1)
+    (left,) = (tmp_path / "recordings").iterdir()
+    assert left.suffix == ".part"
