@@ -97,3 +97,26 @@ def test_a_gate_that_does_not_reach_its_circle_gives_none(learnt):
         for reading, flag in zip(readings, flags, strict=True):
             on = min(np.hypot(*(truth - (reading.x_px, reading.y_px)).T))
             assert flag or on < 0.05
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 60.0])
+def test_a_disc_of_12_px_looks_the_same_wherever_it_lies_between_the_pixels(angle_deg):
+    bench = Bench(distance_m=8.0, angle_deg=angle_deg, fill=12 / 480 * 200 / 50)
+    rng, work = np.random.default_rng(4), Workspace()
+    rest = bench.still()
+    centres = tuple(map(tuple, bench.centres_px().tolist()))
+    half = (6.6 * np.cos(np.radians(angle_deg)), 6.0)
+    stills = [
+        study(grabbed(rest, 1.0, rng), 0, 1, first_look(centres, (half,) * 4), first_slow(4), work)
+        for _ in range(20)
+    ]
+    appearance, limits = learn({0: stills}, 1)[0]
+    forecast = Forecast(appearance, bench.homography, 0.0)
+    slow = Slow(appearance.variance_grey2, appearance.edge_px, 1)
+    flagged = 0
+    for x_mm in np.linspace(0, 9, 25).tolist():
+        expected = forecast.at((x_mm, 0.0, 0.0))
+        readings, _ = measure(grabbed(bench.still(x_mm), 1.0, rng), 0, 1, expected, slow, work)
+        flags = judge(readings, expected, limits, 1.0, bench.width_px, bench.height_px)
+        flagged += sum(bool(flag) for flag in flags)
+    assert flagged <= 1

@@ -24,6 +24,8 @@ ellipse: all points q with q' C^-1 q = 4 for the matrix C of these."""
 FEW_PIXELS = 100
 FLAT_PIXELS = 600
 """Enough of a disc's flat pixels for its levels; of larger discs not every row is used."""
+DEEP_PX = 2.8
+"""So far inside its edge a disc is flat, also half a pixel off the middle of its box."""
 _MAX_GATES = 64
 
 GROUND, DISC, EDGE = 0, 1, 2
@@ -85,7 +87,8 @@ class Gate:
         smallest = min(
             2 * math.sqrt(np.linalg.eigvalsh([[xx, xy], [xy, yy]])[0]) for xx, xy, yy in shapes
         )
-        disc = np.all(distance < -min(margin_px, 0.5 * smallest), axis=0)
+        depth = min(margin_px, max(0.5 * smallest, min(DEEP_PX, 0.85 * smallest)))
+        disc = np.all(distance < -depth, axis=0)
         ground = np.all(distance > margin_px + 0.5, axis=0)
         if not ground.any():
             nearest = distance.min(axis=0)
