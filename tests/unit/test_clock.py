@@ -380,6 +380,20 @@ def test_alternating_fields_share_an_index(begins_with_second: bool) -> None:
     assert any("field missed" in event.text for event in told(clock, "frames-missed"))
 
 
+def test_alternating_fields_that_are_missing_at_first_leave_their_index() -> None:
+    """Held up by half a period, so that by the stamps nothing is missing between two of a kind."""
+    field_ns = int(NTSC_FRAME_PERIOD_S / 2 * 10**9)
+    clock = FrameClock(grabber(scan=Scan.TOP), EXPOSURE_NS)
+    given = [(0, 9e6, Scan.BOTTOM), (2, 0.0, Scan.BOTTOM), (4, 0.0, Scan.BOTTOM)]
+    given += [(n, 0.0, Scan.TOP if n % 2 else Scan.BOTTOM) for n in range(5, 20)]
+    indices = [
+        clock.tick(round(10**9 + n * field_ns + late_ns), n // 2, scan).index
+        for n, late_ns, scan in given
+    ]
+    assert indices == [n // 2 for n, _, _ in given]
+    assert clock.figures.missed == 2
+
+
 @pytest.mark.parametrize(
     ("scan", "event", "quarters", "exposures"),
     [

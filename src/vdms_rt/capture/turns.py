@@ -16,10 +16,14 @@ class FieldTurns:
     def missed(self, place: int, missed: int, scan: Scan) -> int:
         """Return the number missed before a field with which it comes in its turn; `place` is
         what it has if none is missing, even for a frame's first field."""
-        if self._first is None:
+        if self._first is not None:
+            odd = scan is not self._first
+        elif self._before is not None:
+            # Whichever begins a frame, two of a kind have another between them.
+            odd = (self._before[0] + (scan is not self._before[2])) % 2 == 1
+        else:
             return missed
-        second = scan is not self._first
-        if (place + missed) % 2 == second:
+        if (place + missed) % 2 == odd:
             return missed
         return missed - 1 if missed else 1
 
