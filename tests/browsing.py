@@ -18,7 +18,7 @@ import pytest
 from loopback import free_endpoint
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-DEADLINE_S = 90.0
+DEADLINE_S = 60.0
 """How long a test waits for what must come; reached only when it fails."""
 MOVING = Path("config/demo.toml")
 RESTING = "rest_s = 600.0"

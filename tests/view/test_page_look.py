@@ -193,3 +193,37 @@ def test_store_keeps_ten_minutes_and_does_not_grow(page: Page) -> None:
     assert kept[2:4] == [pytest.approx(149999 / 60 - 600, abs=0.02), 149999]
     assert kept[4] == pytest.approx(60)
     assert kept[5:] == [600, pytest.approx(2001 % 7, abs=1e-6)]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_text_stands_out_as_wcag_aa_asks(
+    chrome: Browser, moving: tuple[Station, Server], scheme: str
+) -> None:
+    """WCAG 2.2, 1.4.3: 4.5 to 1 between a text and what is behind it."""
+    pairs = [("ink", "card"), ("ink", "ground"), ("muted", "card"), ("muted", "ground")]
+    pairs += [(name, "card") for name in ("x", "y", "warn", "bad", "accent")]
+    pairs += [("pill-ink", name) for name in ("good", "warn", "bad", "muted")]
+    pairs += [("accent-ink", "accent"), ("ground", "ink"), ("warn", "ground")]
+    with opened(chrome, moving[1].url, scheme=scheme) as page:
+        colours = page.evaluate(
+            """(names) => Object.fromEntries(names.map((name) => {
+              const part = document.createElement("i");
+              part.style.color = `var(--${name})`;
+              document.body.append(part);
+              const rgb = getComputedStyle(part).color.match(/[0-9.]+/g).slice(0, 3).map(Number);
+              part.remove();
+              return [name, rgb];
+            }))""",
+            sorted({name for pair in pairs for name in pair}),
+        )
+    for text, behind in pairs:
+        low, high = sorted(luminance(colours[name]) for name in (text, behind))
+        assert (high + 0.05) / (low + 0.05) >= 4.5, (text, behind)
+
+
+def luminance(rgb: list[float]) -> float:
+    """Return the relative luminance of sRGB, as WCAG defines it."""
+    linear = [
+        c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in rgb)
+    ]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]

@@ -104,9 +104,9 @@ def test_marker_is_found_and_the_reference_taken(page: Page) -> None:
     expect(page.locator("#toast")).not_to_have_class(re.compile("bad"))
     happened(page, re.compile("marker.*found", re.DOTALL))
     expect(page.locator("#state")).to_have_text("measuring")
-    page.fill("#stills", "12")
+    page.fill("#stills", "12")  # of each field
     page.click("text=Take reference")
-    happened(page, "reference taken from 12 pictures")
+    happened(page, "reference taken from 24 pictures")
     expect(page.locator("#state")).to_have_text("measuring")
     page.click("#zero-form button")
     expect(page.locator("#toast")).to_contain_text(re.compile("zero|count", re.IGNORECASE))
@@ -133,10 +133,10 @@ def test_a_run_is_started_marked_and_stopped(
     page: Page, resting: tuple[Station, Server], picture: Callable[[Page, str], None]
 ) -> None:
     page.click("#tab-run")
-    page.fill("#run-name", "page test")
+    page.fill("#run-name", "???")
     page.click("#start")
     expect(page.locator("#toast")).to_have_class("bad")
-    page.fill("#run-name", "sine-10mm")
+    page.fill("#run-name", "sine 10mm")
     page.click("#start")
     expect(page.locator("#run-pill")).to_contain_text("sine-10mm")
     expect(page.locator("#stop")).to_be_visible()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections import deque
@@ -9,9 +10,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from vdms_rt.model import Displacement, Event, Health
+from vdms_rt.setup import SetUpError, set_up_from_json
 from vdms_rt.status import status_words
 from vdms_rt.subscribe import Arrived, Left, Missed, Notice, Sample
 from vdms_rt.view.history import History
+from vdms_rt.wire import vdms_pb2 as pb
 
 EVENTS_KEPT = 200
 SILENT_S = 1.5
@@ -36,8 +39,8 @@ class StationView:
     alive: bool = False
     health: Health | None = None
     markers: dict[str, MarkerView] = field(default_factory=dict)
-    revision: int = 0
-    """Messages of a set-up that came."""
+    order: tuple[str, ...] = ()
+    """Of the markers: as configured, those that move first. Empty before the first set-up."""
 
 
 class Board:
@@ -65,8 +68,7 @@ class Board:
                 "alive": station.alive,
                 "state": _state(station),
                 "health": _health(station.health),
-                "set_ups": station.revision,
-                "markers": {m: _marker(view, now_s) for m, view in station.markers.items()},
+                "markers": {m: _marker(station.markers[m], now_s) for m in _ordered(station)},
             }
             for name, station in sorted(self.stations.items())
         }
@@ -94,8 +96,11 @@ class Board:
             case Event() as event:
                 utc_s = event.utc_ns / 1e9 or now_s
                 self._tell(sample.station, utc_s, event.severity, event.code, event.text)
-            case _ if sample.topic == "setup":
-                station.revision += 1
+            case pb.SetUp() as message:
+                # A station of another version has its markers in the order of their coming.
+                with contextlib.suppress(SetUpError):
+                    shapes = [m.shape for m in set_up_from_json(message.json).markers]
+                    station.order = tuple(s.name for s in sorted(shapes, key=lambda s: s.fixed))
 
     def _notice(self, notice: Notice, now_s: float) -> None:
         name = ""
@@ -129,6 +134,11 @@ class Board:
 
     def _station(self, name: str) -> StationView:
         return self.stations.setdefault(name, StationView())
+
+
+def _ordered(station: StationView) -> list[str]:
+    first = [name for name in station.order if name in station.markers]
+    return first + [name for name in station.markers if name not in first]
 
 
 def _state(station: StationView) -> str:

@@ -50,14 +50,14 @@ class Guard:
         if self.token:
             kind, _, given = request.headers.get("Authorization", "").partition(" ")
             if kind != "Bearer" or not given:
-                return "Controlling needs the token that `vdms-rt view` printed when it started."
-            if not hmac.compare_digest(given.encode(), self.token.encode()):
-                return "This is not the token that `vdms-rt view` printed when it started."
+                return "Controlling needs the token that vdms-rt view printed when it started."
+            if not hmac.compare_digest(_bytes(given), _bytes(self.token)):
+                return "This is not the token that vdms-rt view printed when it started."
             return None
         if not self.local(request):
             return (
                 "From another computer this page is for looking only; start it with "
-                "`vdms-rt view --token` to control from here."
+                "vdms-rt view --token to control from here."
             )
         return None
 
@@ -91,3 +91,8 @@ def _ours(host: str) -> bool:
         own = socket.gethostname().lower()
         return name in ("localhost", own, own.split(".")[0], f"{own.split('.')[0]}.local")
     return True
+
+
+def _bytes(text: str) -> bytes:
+    # A header's bytes that are no UTF-8 have come as surrogates.
+    return text.encode("utf-8", "surrogateescape")

@@ -98,9 +98,12 @@ class _View:
         async with self._listening(host, port) as bound_port:
             collector = asyncio.create_task(self._collect(ended))
             self._tell(host, bound_port)
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(ended.wait(), seconds or None)
+            waiting = asyncio.create_task(ended.wait())
+            await asyncio.wait(
+                (collector, waiting), timeout=seconds or None, return_when=asyncio.FIRST_COMPLETED
+            )
             ended.set()
+            await waiting
             await collector
 
     @contextlib.asynccontextmanager
@@ -191,7 +194,8 @@ class _View:
             if verb == "preview":
                 answer = await self._stations.picture(station)
             else:
-                answer = await self._stations.ask(station, verb, fields)
+                asker = "" if self._guard.local(request) else str(request.remote)
+                answer = await self._stations.ask(station, verb, fields, asker)
         except ControlError as error:
             return _refused(502, "no-answer", str(error))
         except (TypeError, ValueError) as error:

@@ -33,13 +33,15 @@ class Stations:
         self._pool = ThreadPoolExecutor(THREADS, "ask")
         self._pictures: dict[str, tuple[float, asyncio.Future[control.Answer]]] = {}
 
-    async def ask(self, station: str, verb: str, fields: dict[str, Any]) -> control.Answer:
-        """Return a station's answer.
+    async def ask(
+        self, station: str, verb: str, fields: dict[str, Any], asker: str = ""
+    ) -> control.Answer:
+        """Return a station's answer; its log names `asker`, if this is not empty, too.
 
         Raises ControlError if none came, TypeError or ValueError for fields it does not have.
         """
         return await asyncio.get_running_loop().run_in_executor(
-            self._pool, self._ask, station, verb, fields
+            self._pool, self._ask, station, verb, fields, asker
         )
 
     async def picture(self, station: str) -> control.Answer:
@@ -55,8 +57,9 @@ class Stations:
         await asyncio.to_thread(self._pool.shutdown)
         self._open.close()
 
-    def _ask(self, station: str, verb: str, fields: dict[str, Any]) -> control.Answer:
-        return self._link(station).ask(verb, **fields)
+    def _ask(self, station: str, verb: str, fields: dict[str, Any], asker: str) -> control.Answer:
+        who = f"{asker} at {self._who}" if asker else self._who
+        return self._link(station).ask(verb, who=who, **fields)
 
     def _link(self, station: str) -> Controller:
         with self._lock:

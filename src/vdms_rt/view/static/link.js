@@ -99,6 +99,6 @@ export async function ask(station, verb, fields = {}) {
     });
     return await response.json();
   } catch {
-    return { done: false, code: "no-server", text: "The page's server does not answer; is `vdms-rt view` still running?" };
+    return { done: false, code: "no-server", text: "The page's server does not answer; is vdms-rt view still running?" };
   }
 }

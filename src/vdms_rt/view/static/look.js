@@ -11,8 +11,18 @@ const SHORTEST_S = 0.1;
 const FIGURES_MS = 250;
 const VALUE_MS = 100;
 const LEAST_SPECTRUM_S = 10;
+const MOST_MISSING = 0.03;
+/** Less is rounding, as of a fixed marker, and has no place on a logarithmic scale. */
+const LEAST_MM = 1e-6;
 /** The plots' right end lies so far behind the newest sample's time that there is always one. */
 const BEHIND_S = 0.05;
+
+/** Whole decades that hold both: uPlot never ends its ticks on a scale that begins between them. */
+function decades(low, high) {
+  const power = (exponent) => Number(`1e${exponent}`);
+  const least = Math.max(low, LEAST_MM / 10);
+  return [power(Math.floor(Math.log10(least))), power(Math.ceil(Math.log10(Math.max(high, 10 * least))))];
+}
 
 export class Look {
   constructor(store) {
@@ -145,7 +155,7 @@ export class Look {
     const root = byId("spectrum"), ink = () => colour("--muted"), grid = { stroke: () => colour("--grid"), width: 1 };
     const plot = new uPlot({
       width: 320, height: 150, padding: [14, 8, 0, 0], pxAlign: 0, legend: { show: false }, cursor: { show: false },
-      scales: { x: { time: false }, y: { distr: 3, range: (u, low, high) => [Math.max(low, high / 1e5) / 2, high * 3] } },
+      scales: { x: { time: false }, y: { distr: 3, range: (u, low, high) => decades(Math.max(low, high / 1e5), high * 1.5) } },
       axes: [
         { stroke: ink, grid, ticks: grid, size: 26, values: (u, at) => at.map((hz, i) => (i === at.length - 1 ? `${hz} Hz` : `${hz}`)) },
         { stroke: ink, grid: { show: false }, ticks: { show: false }, size: 58, values: (u, at) => at.map((v) => (v === null ? "" : v >= 0.1 ? `${v} mm` : `${+(v * 1000).toPrecision(1)} µm`)) },
@@ -161,13 +171,14 @@ export class Look {
     const axis = byId("spectrum-axis").value;
     const from_s = Math.min(this.from_s, this.to_s - LEAST_SPECTRUM_S);
     const found = spectrum(this.store.between("t_s", from_s, this.to_s), this.store.between(axis, from_s, this.to_s), this.store.period_s());
-    this.peaks = found ? peaks(found, 3) : [];
-    // Without any motion, as of a fixed marker, there is nothing to put on a logarithmic scale.
-    const moves = found?.amplitude.some((a) => a > 0);
+    const moves = found?.amplitude.some((a) => a > LEAST_MM);
+    this.peaks = moves ? peaks(found, 3) : [];
     byId("spectrum").style.visibility = moves ? "visible" : "hidden";
     if (moves) this.spectrum_plot.setData([found.hz.subarray(1), found.amplitude.subarray(1)]);
     const list = byId("peaks");
-    const told = found ? (this.peaks.length ? this.peaks.map((p) => `${p.hz.toFixed(3)} Hz  ${length(p.amplitude)}`) : ["no peak stands out"]) : ["too few samples for a spectrum yet"];
+    const told = this.peaks.map((p) => `${p.hz.toFixed(3)} Hz  ${length(p.amplitude)}`);
+    if (!told.length) told.push(found ? "no peak stands out" : "too few samples for a spectrum yet");
+    if (found?.missing > MOST_MISSING) told.push(`amplitudes too small: ${plain(100 * found.missing, 0)} % of the samples missing`);
     if ([...list.children].map((li) => li.textContent).join() !== told.join()) list.replaceChildren(...told.map((text) => element("li", { textContent: text })));
   }
 
@@ -177,8 +188,11 @@ export class Look {
     ctx.fillStyle = colour("--ink");
     ctx.font = `600 ${12 * scale}px system-ui, sans-serif`;
     ctx.textAlign = "center";
+    const named = [];
     for (const { hz, amplitude } of this.peaks) {
       const left = u.valToPos(hz, "x", true), top = u.valToPos(amplitude, "y", true);
+      if (named.some((other) => Math.abs(other - left) < 32 * scale)) continue;
+      named.push(left);
       const half = ctx.measureText(hz.toFixed(2)).width / 2;
       ctx.fillText(hz.toFixed(2), Math.min(Math.max(left, u.bbox.left + half + 2), u.bbox.left + u.bbox.width - half), Math.max(top - 4 * scale, 11 * scale));
     }

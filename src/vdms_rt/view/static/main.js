@@ -53,7 +53,10 @@ const link = new Link({
 function show_choices() {
   const stations = Object.keys(page.summary);
   choices(byId("station"), stations);
-  choices(byId("marker"), Object.keys(page.summary[byId("station").value]?.markers ?? {}));
+  const markers = Object.keys(page.summary[byId("station").value]?.markers ?? {});
+  choices(byId("marker"), markers);
+  // Until a person chooses one it is the first of those that move.
+  if (markers.includes(chosen_marker)) byId("marker").value = chosen_marker; else if (markers.length) byId("marker").value = markers[0];
   const station = byId("station").value, marker = byId("marker").value;
   if (station === page.station && marker === page.marker) return;
   Object.assign(page, { station, marker, skipped: "" });
@@ -97,7 +100,7 @@ function show_station() {
 }
 
 function banner(state, health, marker) {
-  if (!page.connected) return ["The page's server does not answer; trying again. Is `vdms-rt view` still running?", 2];
+  if (!page.connected) return ["The page's server does not answer; trying again. Is vdms-rt view still running?", 2];
   if (health?.record_trouble && page.alive) return [`Not recording: ${health.record_trouble}`, 2];
   if (HINTS[state]) return [HINTS[state], WAITING.includes(state) ? 1 : 2];
   if (state === "measuring" && marker && !marker.valid) return [`${page.marker}: ${marker.standing}`, 1];
@@ -114,10 +117,11 @@ function show_access() {
 
 function open_token(fault = "") {
   byId("token-fault").textContent = fault;
+  byId("token-dialog").returnValue = "";
   if (!byId("token-dialog").open) byId("token-dialog").showModal();
 }
 
-let toast_timer;
+let chosen_marker = "", toast_timer;
 function toast(text, bad) {
   const box = byId("toast");
   box.textContent = text;
@@ -156,8 +160,9 @@ for (const tab of TABS) {
   };
 }
 byId("station").onchange = () => { show_choices(); show_station(); };
-byId("marker").onchange = () => { show_choices(); show_station(); };
+byId("marker").onchange = () => { chosen_marker = byId("marker").value; show_choices(); show_station(); };
 byId("token-button").onclick = () => open_token();
+byId("token-cancel").onclick = () => byId("token-dialog").close();
 byId("token-dialog").addEventListener("close", () => {
   if (byId("token-dialog").returnValue !== "ok") return;
   setToken(byId("token").value.trim());

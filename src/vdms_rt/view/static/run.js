@@ -50,7 +50,7 @@ export class Run {
     byId("run-name").disabled = Boolean(this.name);
     pill.textContent = `● run ${this.name}`;
     const file = this.open_run;
-    byId("run-standing").textContent = this.name ? `${this.name} is being recorded${file ? `, ${bytes(Number(file.size_bytes))}` : ""}` : "";
+    byId("run-standing").textContent = this.name ? `being recorded${file ? `, ${bytes(Number(file.size_bytes))}` : ""}` : "";
   }
 
   show_list(answer) {

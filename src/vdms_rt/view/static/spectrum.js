@@ -31,7 +31,8 @@ function fft(re, im) {
   }
 }
 
-/** Values at an even pace: what is lost or invalid is put on the line between its neighbours. */
+/** Values at an even pace, and the part of them that was missing: what is lost or invalid is put on
+ * the line between its neighbours. */
 function even(t, v, period_s) {
   const good = [];
   for (let i = 0; i < t.length; i++) if (!Number.isNaN(v[i])) good.push(i);
@@ -44,13 +45,15 @@ function even(t, v, period_s) {
     const a = good[g], b = good[g + 1];
     out[i] = v[a] + ((v[b] - v[a]) * (at - t[a])) / (t[b] - t[a]);
   }
-  return out;
+  return { values: out, missing: 1 - good.length / n };
 }
 
-/** Frequencies in Hz and amplitudes (of a sine, its peak) in the unit of v; null if too short. */
+/** Frequencies in Hz and amplitudes (of a sine, its peak) in the unit of v, and the part of the
+ * samples that is missing; null if there are too few. */
 export function spectrum(t, v, period_s) {
-  const values = even(t, v, period_s);
-  if (!values) return null;
+  const evened = even(t, v, period_s);
+  if (!evened) return null;
+  const { values, missing } = evened;
   let n = SHORTEST;
   while (n * 2 <= values.length && n < LONGEST) n *= 2;
   const window = Float64Array.from({ length: n }, (_, i) => 0.5 - 0.5 * Math.cos((2 * Math.PI * i) / n));
@@ -65,6 +68,7 @@ export function spectrum(t, v, period_s) {
   }
   const step_hz = 1 / (n * period_s);
   return {
+    missing,
     step_hz,
     hz: Float64Array.from(power, (_, k) => k * step_hz),
     // The mean of the Hann window is 1/2, and a sine has half of its amplitude at each frequency.
