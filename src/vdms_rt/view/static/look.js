@@ -155,7 +155,7 @@ export class Look {
     const root = byId("spectrum"), ink = () => colour("--muted"), grid = { stroke: () => colour("--grid"), width: 1 };
     const plot = new uPlot({
       width: 320, height: 150, padding: [14, 8, 0, 0], pxAlign: 0, legend: { show: false }, cursor: { show: false },
-      scales: { x: { time: false }, y: { distr: 3, range: (u, low, high) => decades(Math.max(low, high / 1e5), high * 1.5) } },
+      scales: { x: { time: false }, y: { distr: 3, range: (u, low, high) => decades(Math.max(low, high / 1e4), high) } },
       axes: [
         { stroke: ink, grid, ticks: grid, size: 26, values: (u, at) => at.map((hz, i) => (i === at.length - 1 ? `${hz} Hz` : `${hz}`)) },
         { stroke: ink, grid: { show: false }, ticks: { show: false }, size: 58, values: (u, at) => at.map((v) => (v === null ? "" : v >= 0.1 ? `${v} mm` : `${+(v * 1000).toPrecision(1)} µm`)) },
@@ -178,7 +178,7 @@ export class Look {
     const list = byId("peaks");
     const told = this.peaks.map((p) => `${p.hz.toFixed(3)} Hz  ${length(p.amplitude)}`);
     if (!told.length) told.push(found ? "no peak stands out" : "too few samples for a spectrum yet");
-    if (found?.missing > MOST_MISSING) told.push(`amplitudes too small: ${plain(100 * found.missing, 0)} % of the samples missing`);
+    if (found?.missing > MOST_MISSING) told.push(`amplitudes too small: ${plain(100 * found.missing, 0)} % missing`);
     if ([...list.children].map((li) => li.textContent).join() !== told.join()) list.replaceChildren(...told.map((text) => element("li", { textContent: text })));
   }
 
