@@ -10,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -108,12 +109,19 @@ def test_the_sandbox_lets_it_reset_the_grabber(grabber: Grabber) -> None:
     assert service.pid() == pid
 
 
-def test_what_was_killed_comes_back(grabber: Grabber) -> None:
+def test_what_was_killed_comes_back(grabber: Grabber, capsys: pytest.CaptureFixture[str]) -> None:
     pid, begun = service.pid(), service.now()
+    killed_s = time.monotonic()
     os.kill(pid, signal.SIGKILL)
     wait_for(lambda: service.pid() not in (0, pid), "a new process", service.DEADLINE_S)
+    new_s = time.monotonic() - killed_s
     service.wait_until("active")
     service.wait_until_measuring()
+    measuring_s = time.monotonic() - killed_s
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\nkilled: a new process {new_s:.1f} s, measuring {measuring_s:.1f} s later\n"
+        )
     assert service.show("NRestarts") == "1"
     said = service.journal(begun)
     # Nothing of the recording was lost, nor of the set-up.
@@ -122,12 +130,17 @@ def test_what_was_killed_comes_back(grabber: Grabber) -> None:
     assert list(RECORDINGS.glob("station_*.mcap"))
 
 
-def test_what_hangs_is_ended_by_the_watchdog(grabber: Grabber) -> None:
+def test_what_hangs_is_ended_by_the_watchdog(
+    grabber: Grabber, capsys: pytest.CaptureFixture[str]
+) -> None:
     # From here on without frames, which keep the virtual machine so busy that all takes long.
     grabber.unplug()
     pid, begun = service.pid(), service.now()
+    hung_s = time.monotonic()
     os.kill(pid, signal.SIGSTOP)
     wait_for(lambda: service.pid() not in (0, pid), "a new process", service.DEADLINE_S)
+    with capsys.disabled():
+        sys.stdout.write(f"\nhung: a new process {time.monotonic() - hung_s:.1f} s later\n")
     service.wait_until("active")
     assert service.show("NRestarts") == "2"
     wait_for(lambda: service.show("StatusText").startswith("no device"), "its state", 60)
