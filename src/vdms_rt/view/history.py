@@ -47,7 +47,9 @@ class History:
     """A ring of the samples of one marker; places in it count up for ever. One thread uses it."""
 
     def __init__(self) -> None:
-        self._rows: NDArray[Any] = np.zeros(CAPACITY, _ROW)
+        self._rows: NDArray[Any] = np.empty(CAPACITY, _ROW)
+        # Takes the memory now: touched first as it fills, it would look like a leak for half an hour.
+        self._rows.fill(0)
         self._begin = 0
         self._end = 0
         self._offset_s = 0.0
