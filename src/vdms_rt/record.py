@@ -212,7 +212,8 @@ class Recorder:
         if self._trouble:
             self._backlog.wait_end(max(0.0, self._retry_due_s - time.monotonic()))
         else:
-            self._backlog.wait_ready(POLL_S)
+            until_due_s = max(0.0, self._sync_due_s - time.monotonic())
+            self._backlog.wait_ready(min(POLL_S, until_due_s) if self._log else POLL_S)
         return not self._ending or len(self._backlog) > 0 or self._log is not None
 
     def _work(self) -> None:
@@ -249,8 +250,9 @@ class Recorder:
         self._unsynced.append(item)
 
     def _sync(self, log: LogWriter) -> None:
-        self._timed(log.sync)
+        # From its beginning: a slow disk must not make it rarer.
         self._sync_due_s = time.monotonic() + self._config.sync_s
+        self._timed(log.sync)
         self._resume(log)
 
     def _timed(self, to_disk: Callable[[], None]) -> None:

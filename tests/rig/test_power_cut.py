@@ -11,6 +11,7 @@ import os
 import random
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,8 @@ pytestmark = [pytest.mark.rig, pytest.mark.power]
 
 HERE = Path(__file__).parent
 MOST_LOST_NS = 2_000_000_000
+STALL_NS = 200_000_000
+"""Between two samples, 40 ms apart: longer ones are the machine's, in which nothing happens."""
 GUEST_DIED = 125
 
 
@@ -121,11 +124,13 @@ def test_a_power_cut_costs_at_most_two_seconds(
         assert found == list(range(len(found)))
         pixels = [m.frame_seq for path in recorded for t, _, m in read_whole(path) if t == PIXELS]
         assert pixels == list(range(len(pixels)))
-        lost_ns = [cut_ns - ns for seq, ns in put_ns.items() if seq >= len(found)]
+        lost = [ns for seq, ns in put_ns.items() if seq >= len(found)]
+        gaps_ns = [after - before for before, after in pairwise([*lost, cut_ns])]
+        lost_ns = sum(min(gap, STALL_NS) for gap in gaps_ns)
         with capsys.disabled():
             sys.stdout.write(
                 f"\ncut {number + 1}: {len(put_ns)} put, {len(found)} found, "
-                f"the last {max(lost_ns, default=0) / 1e9:.2f} s lost"
+                f"the last {lost_ns / 1e9:.2f} s lost"
             )
-        assert max(lost_ns, default=0) <= MOST_LOST_NS
+        assert lost_ns <= MOST_LOST_NS
         old = {path.name for path in files(directory)}
