@@ -50,7 +50,8 @@ def set_controls(node: Node, config: V4l2) -> tuple[Facts, tuple[str, ...]]:
         facts.append((name, f"{now} of {known.minimum} to {known.maximum}"))
         if wanted is not None and now != wanted:
             warnings.append(
-                f"{node.name} made {now} of v4l2.{name} = {wanted}; set a value that it keeps"
+                f"{node.name} says {name} {now} after v4l2.{name} = {wanted} was set; some drivers "
+                "forget what they set, so look in the picture which of them holds"
             )
     return tuple(facts), tuple(warnings)
 
