@@ -47,11 +47,12 @@ def wait_until(state: str) -> None:
 
 
 def wait_until_measuring() -> str:
-    """Wait until `systemctl status` says so, and return its status line."""
+    """Wait until `systemctl status` shows a position, and return its status line."""
 
     def status() -> str:
         text = show("StatusText")
-        return text if text.startswith("measuring") and " 0.00 frames" not in text else ""
+        measuring = text.startswith("measuring") and " mm " in text
+        return text if measuring and " 0.00 frames" not in text else ""
 
     try:
         return wait_for(status, "measuring", DEADLINE_S)
