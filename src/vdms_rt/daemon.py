@@ -27,7 +27,7 @@ from vdms_rt.control.desk import Desk
 from vdms_rt.control.server import ControlServer
 from vdms_rt.find import Search
 from vdms_rt.logfile.repair import repair_directory
-from vdms_rt.model import Displacement, Event, Health, Severity, State, VdmsError
+from vdms_rt.model import Displacement, Event, Health, Severity, SourceInfo, State, VdmsError
 from vdms_rt.notify import Notifier
 from vdms_rt.outlet import Outlet
 from vdms_rt.process.loop import Processor
@@ -69,6 +69,7 @@ class Daemon:
         self._faults: list[BaseException] = []
         self._notifier = Notifier()
         self._control: ControlServer | None = None
+        self._named_source: SourceInfo | None = None
         self._fed: tuple[int, Displacement | None] = (0, None)
         self._started_s = time.monotonic()
         self._rates: deque[tuple[float, int]] = deque()
@@ -193,6 +194,7 @@ class Daemon:
             self._rates.append((now_s, self._capture.counters.captured))
             while now_s - self._rates[0][0] > RATE_WINDOW_S:
                 self._rates.popleft()
+            self._name_source()
             if now_s >= health_due_s:
                 health_due_s += HEALTH_S
                 health = self._health()
@@ -205,6 +207,13 @@ class Daemon:
             since_s = self._started_s if first_frame_s is None else first_frame_s
             if seconds and now_s - since_s >= seconds:
                 return
+
+    def _name_source(self) -> None:
+        """Log the head of the file once more for a grabber that was not there when it began."""
+        recorder = self._outlet.recorder
+        begun = recorder is not None and recorder.files
+        if begun and self._capture.counters.info != self._named_source:
+            self._outlet.run(self._run_header())
 
     def _feed_watchdog(self) -> None:
         """Tell systemd that capture went on since the last time, and process too if it had
@@ -339,7 +348,7 @@ class Daemon:
         return capture if capture is not State.STREAMING else self._processor.counters.state
 
     def _run_header(self) -> bytes:
-        info = self._capture.counters.info
+        info = self._named_source = self._capture.counters.info
         clock = self._capture.counters.clock
         facts = [
             ("source", info.name if info else "not open yet"),

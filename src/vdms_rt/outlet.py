@@ -213,6 +213,10 @@ class Outlet:
         if data:
             self._say(topics.PIXELS, "", frame.utc_ns or frame.t_ns, data)
 
+    def run(self, header: bytes) -> None:
+        """Log a serialised `vdms.Run` that tells more than that at the head of the file."""
+        self._say(topics.RUN, "", self.now_ns(), header)
+
     def health(self, health: Health) -> None:
         """Say how the daemon is."""
         self.newest_health = message = convert.health_message(health)

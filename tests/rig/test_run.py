@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from rig.devices import Projector, run
+from rig.devices import Projector, Vivid, run
 from rig.frames import AMPLITUDE_MM
 from rig.station import Station, away_mm
 
@@ -54,7 +54,7 @@ def check(station: Station) -> None:
     assert moving.sum() >= FRAMES
     assert np.ptp(positions_mm[:, 0]) == pytest.approx(2 * AMPLITUDE_MM, abs=0.05)
 
-    (header,) = station.recorded("run")
+    header = station.recorded("run")[-1]
     assert ("standard", "ntsc-m, as configured") in {(f.name, f.value) for f in header.facts}
 
 
@@ -74,3 +74,16 @@ def test_usb_grabber_is_measured(usbtv, tmp_path):
     with Station(tmp_path, "EASY01", input=1, standard="ntsc-m") as station:
         measure(station, lambda: usbtv.set("hold", False))
         check(station)
+
+
+def test_a_device_that_comes_late_is_named_in_the_recording(tmp_path):
+    with Station(tmp_path, "auto", input=1, standard="ntsc-m") as station:
+        station.wait_until_said("recording into")
+        driver = Vivid()
+        station.wait_until_said("opened")
+        station.wait_until_said("no marker in sight")
+        assert station.terminate() == 0, station.said
+    driver.unload()
+    heads = [{f.name: f.value for f in head.facts} for head in station.recorded("run")]
+    assert [head["source"] == "not open yet" for head in heads] == [True, False]
+    assert heads[1]["standard"] == "ntsc-m, as configured"
