@@ -48,7 +48,7 @@ class History:
 
     def __init__(self) -> None:
         self._rows: NDArray[Any] = np.empty(CAPACITY, _ROW)
-        # Takes the memory now: touched first as it fills, it would look like a leak for half an hour.
+        # Takes the memory now: touched only as it fills, it would look like a leak for long.
         self._rows.fill(0)
         self._begin = 0
         self._end = 0
