@@ -155,9 +155,9 @@ class _View:
         ws = web.WebSocketResponse(
             heartbeat=HEARTBEAT_S, max_msg_size=LONGEST_REQUEST_BYTES, compress=False
         )
-        await ws.prepare(request)
-        self._sockets.add(ws)
         try:
+            await ws.prepare(request)
+            self._sockets.add(ws)
             await Feed(self._board, ws).serve(
                 {
                     "version": vdms_rt.__version__,
@@ -166,7 +166,7 @@ class _View:
                 }
             )
         except ConnectionError:
-            pass  # the browser went while it was being told something
+            pass  # the browser went meanwhile
         finally:
             self._sockets.discard(ws)
         return ws
