@@ -152,8 +152,10 @@ def test_wedged_grabber_is_reset_over_usb(usbtv):
 
 
 @pytest.mark.hardware
+@pytest.mark.soak
 def test_it_just_measures(hands, tmp_path):
-    """First light: no configuration at all."""
+    """First light: no configuration at all. In the virtual machine test_service shows it each
+    time, and this one is for `make soak`."""
     hands.hold(True)
     hands.plug()
     with Station.without_configuration(tmp_path) as station:
