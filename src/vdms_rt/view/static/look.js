@@ -155,7 +155,7 @@ export class Look {
     const root = byId("spectrum"), ink = () => colour("--muted"), grid = { stroke: () => colour("--grid"), width: 1 };
     const plot = new uPlot({
       width: 320, height: 150, padding: [14, 8, 0, 0], pxAlign: 0, legend: { show: false }, cursor: { show: false },
-      scales: { x: { time: false }, y: { distr: 3, range: (u, low, high) => decades(Math.max(low, high / 1e4), high) } },
+      scales: { x: { time: false }, y: { distr: 3, range: (u, low, high) => decades(Math.max(low, high / 1e5), high) } },
       axes: [
         { stroke: ink, grid, ticks: grid, size: 26, values: (u, at) => at.map((hz, i) => (i === at.length - 1 ? `${hz} Hz` : `${hz}`)) },
         { stroke: ink, grid: { show: false }, ticks: { show: false }, size: 58, values: (u, at) => at.map((v) => (v === null ? "" : v >= 0.1 ? `${v} mm` : `${+(v * 1000).toPrecision(1)} µm`)) },
