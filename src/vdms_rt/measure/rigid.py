@@ -12,8 +12,8 @@ from dataclasses import dataclass
 LEAST_CIRCLES = 3
 """Two circles fix x, y and rotation, and would hide a wrong one; the third can contradict."""
 
-HARDLY = (2.6, 2.2)
-"""Quantile 0.95 of chi-square over its degrees of freedom, for three circles (3) and for four (5);
+HARDLY = (2.1, 1.85)
+"""Quantile 0.90 of chi-square over its degrees of freedom, for three circles (3) and for four (5);
 more of them lie below."""
 BIRGE_LIMIT = (5.4, 4.1)
 """Quantile 0.999."""
@@ -162,7 +162,7 @@ def position_covariance(
     sees them: their errors carry over to every later sample just as a picture's own do. Where the
     circles disagree by more than noise does in one picture of a thousand, something else is at
     work on them, and their covariances count for as much more (Birge 1932); from one picture in
-    twenty on, for what they exceed that limit.
+    ten on, for what they exceed that limit.
     """
     arms = _arms(reference_mm)
     used = [k for k, usable in enumerate(motion.used) if usable]

@@ -24,9 +24,9 @@ STEP = 0.5
 """Of the tables, in edge widths."""
 LONGEST = 24.0
 FINE = 1 / 16
-SMEARED_WAY = 3.5
+SMEARED_WAY = 2.5
 """In edge widths: beyond this way the weights that are nearly proportional to the light cost less
-by their noise (7 % at 4 widths, 3 % at 8) than the others by what is known badly of their bias."""
+by their noise (9 % at 2 widths, 3 % at 8) than the others by what is known badly of their bias."""
 
 
 class Smear(NamedTuple):
