@@ -106,8 +106,8 @@ def station(directory: Path, *, moving: bool) -> Iterator[Station]:
     endpoint = free_endpoint()
     text = MOVING.read_text().replace("tcp/127.0.0.1:7447", endpoint)
     text = text.replace("demo-recordings", str(directory / "recordings"))
-    assert "rest_s = 3.0\n" in text
-    text = text.replace("rest_s = 3.0\n", f"rest_s = {REST_S[moving]}\n")
+    assert "rest_s = 4.0\n" in text
+    text = text.replace("rest_s = 4.0\n", f"rest_s = {REST_S[moving]}\n")
     config = directory / "station.toml"
     config.write_text(text)
     running = Station(
