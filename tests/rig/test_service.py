@@ -116,6 +116,9 @@ def test_what_was_killed_comes_back(grabber: Grabber, capsys: pytest.CaptureFixt
     wait_for(lambda: service.pid() not in (0, pid), "a new process", service.DEADLINE_S)
     new_s = time.monotonic() - killed_s
     service.wait_until("active")
+    # The emulated cable does not always outlive who is killed in the middle of a transfer.
+    if not grabber.device():
+        grabber.plug()
     service.wait_until_measuring()
     measuring_s = time.monotonic() - killed_s
     with capsys.disabled():
@@ -134,7 +137,8 @@ def test_what_hangs_is_ended_by_the_watchdog(
     grabber: Grabber, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # From here on without frames, which keep the virtual machine so busy that all takes long.
-    grabber.unplug()
+    if grabber.device():
+        grabber.unplug()
     pid, begun = service.pid(), service.now()
     hung_s = time.monotonic()
     os.kill(pid, signal.SIGSTOP)
