@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from tools.bench.picture import Bench, grabbed
-from vdms_rt.measure.expect import Forecast, first_look, raster
+from vdms_rt.measure.expect import Forecast, first_look
 from vdms_rt.measure.gate import Workspace
+from vdms_rt.measure.raster import raster
 from vdms_rt.measure.smooth import Slow, first_slow, measure, study
 from vdms_rt.measure.validity import learn
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vdms_rt.measure.expect import NO_RASTER, Appearance, Expected, Raster, raster
+from vdms_rt.measure.expect import Appearance, Expected
+from vdms_rt.measure.raster import NO_RASTER, Raster, raster
 from vdms_rt.measure.smooth import CircleReading, Slow
 from vdms_rt.model import CircleFlag
 
