@@ -161,9 +161,11 @@ def test_a_zero_a_reference_and_regions(ask: Controller) -> None:
     wait(lambda: ask.ask("status").status.set_up.revision == revision + 1)
     assert ask.ask("reference", stills=12).applied
     wait(lambda: ask.ask("status").status.set_up.revision == revision + 2)
+    # The new reference is younger than the second that a zero is the mean of.
+    assert ask.ask("zero").done
     assert json.loads(ask.ask("status").status.set_up.json)["stills"] == 24
     assert ask.ask("find").applied
-    wait(lambda: ask.ask("status").status.set_up.revision == revision + 3)
+    wait(lambda: ask.ask("status").status.set_up.revision == revision + 4)
 
 
 @pytest.mark.parametrize(

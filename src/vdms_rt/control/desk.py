@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotInTime
@@ -42,6 +43,9 @@ from vdms_rt.wire.verbs import Request
 
 APPLY_S = 2.0
 """For the process thread to come to the end of a frame: longer only while no frames come."""
+REST_S = 2.0
+"""For a marker to have rested as long as a zero needs, after a new reference."""
+AGAIN_S = 0.1
 STROKE_S = 30.0
 MOST_STILLS = 1000
 LONGEST_TEXT = 500
@@ -122,8 +126,7 @@ class Desk:
                 return self._stroke(request)
             case control.RegionsRequest() if not request.regions:
                 return self._regions_in_use(request.marker)
-        applied = self._ask(self._command(request))
-        assert isinstance(applied, Applied)
+        applied = self._applied(self._command(request))
         return control.Answer(text=applied.text, applied=True, seq=applied.seq)
 
     def _command(self, request: Request) -> Command:
@@ -150,6 +153,20 @@ class Desk:
                 return self._size(request)
             case _:
                 raise AssertionError(request)
+
+    def _applied(self, command: Command) -> Applied:
+        """Have a command carried out, with patience where only time is missing. Raises Refused."""
+        until_s = time.monotonic() + REST_S
+        while True:
+            try:
+                applied = self._ask(command)
+            except Refused as refused:
+                if refused.code != "few-samples" or time.monotonic() > until_s:
+                    raise
+                time.sleep(AGAIN_S)
+                continue
+            assert isinstance(applied, Applied)
+            return applied
 
     def _ask(self, command: Command) -> Applied | Snapshot:
         """Hand a command to the process thread and wait for its end. Raises Refused."""
