@@ -257,6 +257,8 @@ INVALID_STATUS = (
     | Status.NO_SIGNAL
 )
 """A sample with any of these is not a measurement."""
+_INVALID = int(INVALID_STATUS)
+"""As a number, for it takes a flag over a microsecond to be masked."""
 
 
 def damage_status(damage: Damage) -> Status:
@@ -311,7 +313,7 @@ class Displacement:
 
     @property
     def valid(self) -> bool:
-        return not self.status & INVALID_STATUS
+        return not int(self.status) & _INVALID
 
 
 @dataclass(frozen=True, slots=True)

@@ -128,6 +128,35 @@ def test_closing_wakes_a_waiting_reader() -> None:
     reader.join()
 
 
+def test_every_reader_of_a_closed_ring_ends() -> None:
+    ring = ring_of(2, 2, live=True)
+    ended = threading.Semaphore(0)
+
+    def read() -> None:
+        with pytest.raises(RingClosed):
+            ring.take(60)
+        ended.release()
+
+    readers = [threading.Thread(target=read) for _ in range(3)]
+    for reader in readers:
+        reader.start()
+    ring.close()
+    for reader in readers:
+        assert ended.acquire(timeout=10)
+        reader.join()
+
+
+def test_a_closed_ring_ends_also_after_its_frames_were_dropped() -> None:
+    ring = ring_of(2, 2, live=True)
+    write(ring, 0)
+    ring.close()
+    assert ring.used == 1
+    ring.drop()
+    assert ring.used == 0
+    with pytest.raises(RingClosed):
+        ring.take(0)
+
+
 def test_an_abandoned_slot_is_free_again() -> None:
     ring = ring_of(2, 2, live=False)
     for _ in range(1000):
