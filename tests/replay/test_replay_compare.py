@@ -126,7 +126,7 @@ def test_a_plot_of_one_recording(fields: Case, tmp_path: Path) -> None:
     [
         (("--column", "z_mm"), "has no column z_mm; it has x_mm"),
         (("--marker", "m9"), "has no marker m9; it has m1"),
-        (("--from-s", "500"), "no sample of marker m1 lies between 500 and inf s"),
+        (("--from-s", "500"), "no sample of marker m1 lies after 500 s"),
         (("--offset", "300"), "no common motion within 0.5 s of the offset 300 s"),
         (("--plot", "plot.doc"), "a plot is a .pdf, .svg or .png file, not .doc"),
     ],

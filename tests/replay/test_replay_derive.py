@@ -217,3 +217,15 @@ def test_too_few_samples(tmp_path, capsys):
     path = write_recording(tmp_path / "a.mcap", range(3))
     assert run(["derive", str(path), "--modes"]) == 1
     assert "3 valid samples" in capsys.readouterr().err
+
+
+def test_stretches_too_short_for_a_filter_are_left_out_and_said(tmp_path):
+    path = write_recording(
+        tmp_path / "a.mcap", range(400), lost=[*range(300, 312), *range(320, 332)]
+    )
+    for recipe in (Recipe(high_hz=5.0, order=8), Recipe(rate_hz=30)):
+        table = derive(read(path), recipe)
+        between_s = (312 * PERIOD_NS / 1e9, 319 * PERIOD_NS / 1e9)
+        assert not table["time_s"].between(*between_s).any()
+        assert (table["time_s"] > between_s[1]).sum() > 30
+        assert "8 of 376 samples lie in stretches too short for this" in table.attrs["derived"][-1]

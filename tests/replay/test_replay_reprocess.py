@@ -245,3 +245,13 @@ def test_a_part_without_stills_cannot_change_its_sampling(tmp_path: Path) -> Non
     assert json.loads(read(parts[1]).about.run.effective_config)["process"]["sampling"] == "auto"
     account = reprocess(parts[1], out=tmp_path / "otsu.mcap", jobs=1, method="otsu")
     assert account.samples > 30
+
+
+def test_the_recording_itself_is_never_written_over(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "lab.mcap", range(90), pixels=True)
+    before = path.read_bytes()
+    (tmp_path / "alias.mcap").symlink_to(path)
+    for name in ("lab.mcap", "alias.mcap"):
+        with pytest.raises(ReplayError, match=f"{name}: is the recording itself"):
+            reprocess(path, out=tmp_path / name, jobs=1, force=True)
+    assert path.read_bytes() == before

@@ -57,8 +57,8 @@ def choose(
     inside = table[(table["time_s"] >= from_s) & (table["time_s"] <= to_s)]
     if inside.empty:
         raise ReplayError(
-            f"{_named(recording)}: no sample of marker {name} lies between {from_s:g} and "
-            f"{to_s:g} s; it has samples from {table['time_s'].iloc[0]:.1f} to "
+            f"{_named(recording)}: no sample of marker {name} lies {_between(from_s, to_s)}; "
+            f"it has samples from {table['time_s'].iloc[0]:.1f} to "
             f"{table['time_s'].iloc[-1]:.1f} s"
         )
     measured = inside[inside["valid"]]
@@ -140,6 +140,10 @@ def _set_up(
     except (KeyError, SetUpError):
         return None, None
     return set_up, next((m for m in set_up.markers if m.shape.name == marker), None)
+
+
+def _between(from_s: float, to_s: float) -> str:
+    return f"after {from_s:g} s" if math.isinf(to_s) else f"between {from_s:g} and {to_s:g} s"
 
 
 def _named(recording: Recording) -> str:

@@ -152,6 +152,7 @@ def page(one: Comparison) -> str:
     if one.spectrum is not None and one.spectrum.lines:
         lines += [
             "",
+            "  amplitudes are means over all that was compared",
             f"  {'Hz':>9} {'amplitude mm':>13} {'error %':>9} {'phase deg':>10} {'late ms':>9} "
             f"{'coherence':>10}",
         ]
@@ -250,7 +251,7 @@ def _exposed(one: Comparison) -> str:
         "progressive": "whole frames",
     }[one.chosen.exposed]
     exposure_ms = 1000 * one.camera.exposure_s
-    light = f"exposed for {exposure_ms:.3f} ms" if exposure_ms else "exposed for a moment"
+    light = f"exposure {exposure_ms:.3g} ms" if exposure_ms else "exposure negligible"
     return f"{seen}, {light}"
 
 

@@ -6,7 +6,7 @@ import argparse
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -17,6 +17,11 @@ from vdms_replay.formats import FORMATS
 from vdms_replay.load import Recording, iso, read
 from vdms_replay.source import ReplayError
 from vdms_replay.verb import Verbs, make_parser, number, progress
+
+if TYPE_CHECKING:
+    from vdms_replay.signals import Stretch
+
+Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
 
 AXES = ("x_mm", "y_mm", "rotation_mrad")
 DERIVATIVES = (("velocity", 1, "per_s"), ("acceleration", 2, "per_s2"))
@@ -162,11 +167,15 @@ def derive(recording: Recording, recipe: Recipe, marker: str | None = None) -> p
             stretches = [signals.detrended(one, recipe.detrend) for one in stretches]
             told.append(f"less the {recipe.detrend} of each stretch")
         if recipe.low_hz is not None or recipe.high_hz is not None:
-            stretches = [
-                signals.filtered(one, recipe.low_hz, recipe.high_hz, recipe.order)
-                for one in stretches
-            ]
+            stretches = signals.filtered_each(
+                stretches, recipe.low_hz, recipe.high_hz, recipe.order
+            )
             told.append(_filter_text(recipe))
+        if lost := _left_out(time_s, stretches):
+            told.append(
+                f"{lost} of {len(time_s)} samples lie in stretches too short for this, and are "
+                "left out; --max-gap closes gaps"
+            )
     except signals.SignalError as error:
         raise ReplayError(f"{error}") from None
     columns = {"time_s": np.concatenate([one.times_s() for one in stretches])}
@@ -186,6 +195,15 @@ def derive(recording: Recording, recipe: Recipe, marker: str | None = None) -> p
     table.attrs["derived"] = told
     table.attrs["rate_hz"] = rate_hz
     return table
+
+
+def _left_out(time_s: Floats, stretches: list[Stretch]) -> int:
+    """Return how many of the samples lie in none of the stretches."""
+    inside = np.zeros(len(time_s), np.bool_)
+    for one in stretches:
+        end_s = one.start_s + len(one.values) * one.step_s
+        inside |= (time_s > one.start_s - one.step_s) & (time_s < end_s)
+    return int((~inside).sum())
 
 
 def _check(recipe: Recipe) -> None:
@@ -211,7 +229,7 @@ def _with_times(table: pd.DataFrame, samples: pd.DataFrame) -> pd.DataFrame:
 
 
 def _evenly_text(
-    time_s: np.ndarray[Any, np.dtype[np.float64]],
+    time_s: Floats,
     own_hz: float,
     rate_hz: float,
     max_gap_s: float,

@@ -13,7 +13,7 @@ import pandas as pd
 from vdms_replay.columns import MEANINGS, UNITS, Clock, Samples
 from vdms_replay.formats import FORMATS, FormatError, Writer
 from vdms_replay.load import ROWS_AT_ONCE, About, Once, iso, metadata
-from vdms_replay.source import SAMPLE, Entry, PathLike, ReplayError, Source
+from vdms_replay.source import SAMPLE, Entry, PathLike, ReplayError, Source, keep
 from vdms_replay.verb import Verbs, make_parser, progress
 from vdms_rt.wire import vdms_pb2 as pb
 
@@ -136,8 +136,7 @@ def target_path(recordings: Sequence[Path], to: str, out: PathLike | None) -> Pa
     """
     stem = recordings[0].name.partition(".mcap")[0]
     target = Path(out) if out is not None else recordings[0].with_name(stem + FORMATS[to][0])
-    if target.resolve() in [path.resolve() for path in recordings]:
-        raise ReplayError(f"{target}: is the recording itself; choose another --out")
+    keep(recordings, target)
     return target
 
 

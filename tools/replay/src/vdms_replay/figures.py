@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from vdms_replay.source import ReplayError
@@ -115,11 +117,18 @@ def density(axes: Axes, f: Floats, values: Floats, colour: str, label: str, **ho
     axes.loglog(f[1:], np.sqrt(np.maximum(values[1:], 1e-30)), color=colour, label=label, **how)
 
 
+def plain_numbers(axis: Axis) -> None:
+    """Number a logarithmic axis as people write it: 0.1, 0.2, 0.5, 1."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def figure_of_comparison(one: Comparison) -> Figure:
     """Return both series, their difference, and what both hold at each frequency."""
     g = one.agreement
     with styled():
-        figure = new_figure(6.6 if one.spectrum is not None else 4.2)
+        figure = new_figure(6.2 if one.spectrum is not None else 4.0)
         rows = [2.0, 1.4, 2.0, 1.0] if one.spectrum is not None else [2.0, 1.4]
         panels: Any = figure.subplots(len(rows), 1, height_ratios=rows)
         both, rest = panels[:2]
@@ -158,6 +167,7 @@ def figure_of_comparison(one: Comparison) -> Figure:
             together.set_ylabel("coherence")
             together.set_xlabel("frequency, Hz")
             together.sharex(amplitude)
+            plain_numbers(together.xaxis)
     return figure
 
 
@@ -191,6 +201,7 @@ def figure_of_cases(found: Sequence[Comparison]) -> Figure:
         panels[0].set_title("Error over distance, for each angle")
         panels[1].set_title("Error over angle, for each distance")
         _whole_decades(panels[0], [case[2] for case in where])
+        plain_numbers(panels[0].yaxis)
     return figure
 
 

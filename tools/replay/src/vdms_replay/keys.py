@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import shutil
 import sys
 import termios
 import threading
@@ -60,7 +61,8 @@ def _listen(fd: int, player: Player, stop: threading.Event) -> None:
             for key in split(os.read(fd, 64)):
                 if key in KEYS:
                     KEYS[key](player)
-        sys.stderr.write(f"\r{line(player)}\x1b[K")
+        width = shutil.get_terminal_size().columns
+        sys.stderr.write(f"\r{line(player)[: width - 1]}\x1b[K")
         sys.stderr.flush()
 
 

@@ -160,7 +160,7 @@ def _heads(recording: Recording, chosen: Chosen, summary: MarkerSummary) -> list
         "progressive": "whole frames",
     }[chosen.exposed]
     exposure_ms = 1000 * exposure_of(about.config)
-    light = f"exposed for {exposure_ms:.3f} ms" if exposure_ms else "exposed for a moment"
+    light = f"exposure {exposure_ms:.3g} ms" if exposure_ms else "exposure negligible"
     method = about.config.get("process", {}).get("method", "")
     rows = [
         ("Recording", ", ".join(path.name for path in recording.paths)),
@@ -180,6 +180,8 @@ def _heads(recording: Recording, chosen: Chosen, summary: MarkerSummary) -> list
             )
         )
     rows.append(("Recorded by", f"vdms-rt {about.run.version}"))
+    ends = "; ".join(dict.fromkeys(end.reason for end in about.ends))
+    rows.append(("Ended", ends or "without an end: cut off"))
     rows += [(f.name.capitalize(), f.value) for f in about.run.facts if "again" in f.name]
     return rows
 
@@ -224,7 +226,7 @@ def _quality(recording: Recording, chosen: Chosen, summary: MarkerSummary) -> li
         ("Valid", f"{summary.valid} of {summary.samples} samples, {part:.2f} %"),
         *_counted("Without a position", summary.invalid),
         *_counted("Valid with a reservation", summary.flagged),
-        ("Missing", f"{summary.lost} samples in {summary.gap_count} gaps"),
+        ("Missing", _missing(summary)),
     ]
     if math.isfinite(summary.sigma_x_mm):
         rows.append(
@@ -265,6 +267,12 @@ def _quality(recording: Recording, chosen: Chosen, summary: MarkerSummary) -> li
     return rows
 
 
+def _missing(summary: MarkerSummary) -> str:
+    if not summary.gap_count:
+        return "none"
+    return f"{summary.lost} samples in {summary.gap_count} gap{'s' * (summary.gap_count > 1)}"
+
+
 def _counted(name: str, counts: dict[str, int]) -> list[tuple[str, str]]:
     if not counts:
         return []
@@ -295,7 +303,11 @@ def _comparison(one: Comparison) -> list[Block]:
             f"{ref.path.name}, column {ref.column} in {ref.unit}, {ref.series.rate_hz:.6g} Hz. The "
             "reference is taken at the camera's times, as its mean over each exposure."
         ),
-        Drawing(figure_of_comparison(one), ""),
+        Drawing(
+            figure_of_comparison(one),
+            "Amplitudes in the table of frequencies are means over all that was compared; a motion "
+            "that does not last all the time shows less.",
+        ),
         Facts([(name[:1].upper() + name[1:], text.replace("+-", "±").replace(" um", " µm"))
                for name, text in compare.rows(one)]),
     ]  # fmt: skip
@@ -347,11 +359,8 @@ def _set_up_text(recording: Recording, chosen: Chosen) -> list[Block]:
 
 def _happened(recording: Recording) -> list[Block]:
     events = [e for e in recording.about.events if e.severity != pb.Event.INFO]
-    ends: list[Block] = [Facts([("End", end.reason) for end in recording.about.ends])]
-    if not recording.about.ends:
-        ends = [Words("The recording has no end: it was cut off.")]
     if not events:
-        return [Heading("Events"), Words("No warning and no error."), *ends]
+        return [Heading("Events"), Words("No warning and no error.")]
     alike: dict[str, list[pb.Event]] = {}
     for event in events:
         alike.setdefault(event.code, []).append(event)
@@ -361,7 +370,7 @@ def _happened(recording: Recording) -> list[Block]:
         if len(same) > 1:
             text += f" (and {len(same) - 1} more of the kind, the last at {_time(same[-1].utc_ns)})"
         rows.append((_time(same[0].utc_ns) or "at a time not known", text))
-    return [Heading("Warnings and errors"), Facts(rows), *ends]
+    return [Heading("Warnings and errors"), Facts(rows)]
 
 
 def _time(utc_ns: int) -> str:

@@ -24,6 +24,7 @@ from vdms_replay.figures import (
     Floats,
     curve,
     new_figure,
+    plain_numbers,
     styled,
     with_gaps,
 )
@@ -151,12 +152,13 @@ def figure_of_path_and_lines(chosen: Chosen, lines: Lines | None) -> Figure:
                 amplitude.axhline(
                     lines.floor_mm, color=GREY, linewidth=0.8, linestyle=":", label="noise, stated"
                 )
+            plain_numbers(amplitude.xaxis)
             amplitude.set_xlabel("frequency, Hz")
             amplitude.set_ylabel("amplitude, mm")
             amplitude.set_title("Amplitude spectrum")
             amplitude.legend(loc="upper right")
         step = max(1, len(x) // 6000)
-        path.plot(x[::step], y[::step], color=BLUE, linewidth=0.6)
+        path.plot(x[::step], y[::step], color=BLUE, linewidth=0.9)
         path.plot(0, 0, marker="+", color=ORANGE, markersize=9, markeredgewidth=1.2)
         path.set_aspect("equal", adjustable="datalim")
         path.set_xlabel("x, mm")

@@ -11,7 +11,7 @@ from google.protobuf.message import DecodeError
 
 from vdms_replay.account import Account
 from vdms_replay.export import add_output_options
-from vdms_replay.source import PathLike, ReplayError, Source
+from vdms_replay.source import PathLike, ReplayError, Source, keep
 from vdms_replay.verb import Advance, Verbs, make_parser, progress
 
 
@@ -96,6 +96,7 @@ def reprocess(
     source = Source(files)
     first = source.paths[0]
     out = out or first.with_name(f"{first.name.partition('.mcap')[0]}-again.mcap")
+    keep(source.paths, out)
     settings = Settings(method, sampling, None if lens is None else read_lens(lens), refit_time)
     if not settings.changed and not is_current(source):
         settings = settings._replace(other_version=True)

@@ -29,6 +29,10 @@ class SignalError(ValueError):
     """What was asked for cannot be done with this series; a phrase says why."""
 
 
+class ShortError(SignalError):
+    """A stretch is too short for a filter."""
+
+
 @dataclass(frozen=True, slots=True)
 class Stretch:
     """Evenly spaced values without a gap."""
@@ -55,16 +59,22 @@ def evenly(time_s: Floats, values: Floats, rate_hz: float, max_gap_s: float) -> 
 
     Times more than `max_gap_s` apart end a stretch; one of fewer than four values is left out. For
     a rate below the times' own the values are low-passed first (Butterworth of order 8, twice, to
-    0.8 of the new Nyquist frequency). Raises SignalError if nothing is left.
+    0.8 of the new Nyquist frequency), and stretches too short for that are left out. Raises
+    SignalError if nothing is left.
     """
     step_s = 1 / rate_hz
     cuts = np.flatnonzero(np.diff(time_s) > max_gap_s) + 1
     stretches = []
+    short = SignalError("no stretch of four valid samples without a gap is in it")
     for times, part in zip(np.split(time_s, cuts), np.split(values, cuts), strict=True):
         if len(times) < LEAST:
             continue
         if rate_hz < 0.9 * own_rate_hz(times):
-            times, part = _low_passed(times, part, rate_hz)  # noqa: PLW2901
+            try:
+                times, part = _low_passed(times, part, rate_hz)  # noqa: PLW2901
+            except ShortError as error:
+                short = error
+                continue
         first = math.ceil((times[0] - time_s[0]) / step_s - 1e-6)
         last = math.floor((times[-1] - time_s[0]) / step_s + 1e-6)
         if last - first + 1 < LEAST:
@@ -72,7 +82,7 @@ def evenly(time_s: Floats, values: Floats, rate_hz: float, max_gap_s: float) -> 
         at = np.asarray(time_s[0] + step_s * np.arange(first, last + 1), np.float64)
         stretches.append(Stretch(float(at[0]), step_s, np.asarray(CubicSpline(times, part)(at))))
     if not stretches:
-        raise SignalError("no stretch of four valid samples without a gap is in it")
+        raise short
     return stretches
 
 
@@ -89,7 +99,8 @@ def filtered(stretch: Stretch, low_hz: float | None, high_hz: float | None, orde
     """Return the stretch within a band, by a Butterworth filter run forwards and backwards.
 
     The amplitude at `low_hz` and `high_hz` is one half (-6 dB): each pass takes 3 dB. Raises
-    SignalError for an edge beyond the Nyquist frequency or a stretch too short to filter.
+    SignalError for an edge beyond the Nyquist frequency, ShortError for a stretch too short to
+    filter.
     """
     nyquist_hz = 0.5 / stretch.step_s
     edges = [edge for edge in (low_hz, high_hz) if edge is not None]
@@ -105,7 +116,7 @@ def filtered(stretch: Stretch, low_hz: float | None, high_hz: float | None, orde
         )
     least = 3 * (2 * len(sos) + 1)
     if len(stretch.values) <= least:
-        raise SignalError(
+        raise ShortError(
             f"a stretch of {len(stretch.values)} values is too short for this filter, which needs "
             f"{least + 1}; close gaps with --max-gap, or take a lower order"
         )
@@ -114,6 +125,23 @@ def filtered(stretch: Stretch, low_hz: float | None, high_hz: float | None, orde
     pad = min(max(settling, least), len(stretch.values) - 1)
     values = signal.sosfiltfilt(sos, stretch.values, axis=0, padtype="odd", padlen=pad)
     return Stretch(stretch.start_s, stretch.step_s, np.asarray(values, np.float64))
+
+
+def filtered_each(
+    stretches: list[Stretch], low_hz: float | None, high_hz: float | None, order: int
+) -> list[Stretch]:
+    """Return the stretches `filtered`, without those too short for it. Raises SignalError, also if
+    none is left."""
+    kept = []
+    short = SignalError("there is nothing to filter")
+    for stretch in stretches:
+        try:
+            kept.append(filtered(stretch, low_hz, high_hz, order))
+        except ShortError as error:
+            short = error
+    if not kept:
+        raise short
+    return kept
 
 
 def _sections(

@@ -168,6 +168,12 @@ def _first(path: Path) -> tuple[int, str]:
     raise ReplayError(f"{path}: an MCAP, but not one that vdms-rt recorded, or an empty one")
 
 
+def keep(recordings: Iterable[Path], target: Path) -> None:
+    """Raise ReplayError if `target`, where something is to be written, is one of the recordings."""
+    if target.resolve() in [path.resolve() for path in recordings]:
+        raise ReplayError(f"{target}: is the recording itself; choose another --out")
+
+
 def station_of(key: str) -> str:
     """Return the station in a key `vdms/<station>/...`; empty if it has none."""
     return key.split("/")[1] if key.count("/") > 1 else ""
