@@ -79,6 +79,7 @@ def write_recording(
     pixels: bool = False,
     finish: bool = True,
     sync_every: int = 30,
+    health: Mapping[str, int] | None = None,
 ) -> Path:
     """Write samples `seqs` of each marker, those in `lost` left out; return the file's path, which
     ends in .part where it is not finished."""
@@ -154,8 +155,9 @@ def write_recording(
         if seq % sync_every == 0:
             log.sync()
         if seq % 60 == 0:
-            health = pb.Health(session=session, utc_ns=at_ns, state="measuring", missed=len(lost))
-            add(topics.HEALTH, at_ns, health)
+            counters = {"missed": len(lost), **(health or {})}
+            standing = pb.Health(session=session, utc_ns=at_ns, state="measuring", **counters)
+            add(topics.HEALTH, at_ns, standing)
     end_ns = t_ns_of(seqs[-1]) + utc_offset_ns
     add(
         topics.EVENT,

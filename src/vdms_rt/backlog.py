@@ -39,6 +39,7 @@ class Backlog:
         self._spared: dict[str, _Lost] = {}
         self._sparing = False
         self._lost_messages = 0
+        self._lost_pixels = 0
         self._waiting_allowed = not live
         self._paused = False
         self._ended = False
@@ -53,6 +54,12 @@ class Backlog:
         """Of the whole run."""
         with self._lock:
             return self._lost_messages
+
+    @property
+    def lost_pixels(self) -> int:
+        """Of the lost messages those with a frame's pixels."""
+        with self._lock:
+            return self._lost_pixels
 
     def put(self, topic: Topic, key: str, log_time_ns: int, data: bytes) -> bool:
         """Queue a message; False if it was dropped, which is counted and remembered.
@@ -196,6 +203,7 @@ class Backlog:
 
     def _lose(self, message: LogMessage, among: dict[str, _Lost] | None = None) -> None:
         self._lost_messages += 1
+        self._lost_pixels += message.type is pb.Pixels
         lost = self._lost if among is None else among
         lost.setdefault(message.key, _Lost(message.type is pb.Displacement)).add(message)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from vdms_rt.model import VdmsError
+from vdms_rt.status import not_recorded
 
 if TYPE_CHECKING:
     from vdms_rt.control.client import Credentials
@@ -195,6 +196,9 @@ def _status_text(status: control.Status) -> str:
         ("disk", f"{health.disk_free_bytes / 1e9:.1f} GB free" if health.recording else "not used"),
         ("clock", f"{health.utc_state}, {health.clock_sigma_us:.0f} us"),
     ]
+    if health.not_recorded:
+        left_out = not_recorded(health.not_recorded, health.pixels_left_out)
+        rows.insert(6, ("left out", left_out))
     lines = [f"{name:<11}{value}" for name, value in rows]
     if status.HasField("set_up"):
         lines += status.set_up.report.splitlines()

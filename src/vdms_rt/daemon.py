@@ -326,6 +326,7 @@ class Daemon:
             measured=process.measured,
             invalid=process.invalid,
             not_recorded=record.not_recorded if record else 0,
+            pixels_left_out=record.pixels_left_out if record else 0,
             unsent=publisher.unsent if publisher else 0,
             frame_rate_hz=rate_hz,
             sample_age_ms=self._outlet.sample_age_ms(),

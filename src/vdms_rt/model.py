@@ -421,6 +421,9 @@ class Health:
     """Frames that were the one before, delivered once more."""
     no_signal: int = 0
     """Frames in which the grabber showed no camera's picture."""
+    pixels_left_out: int = 0
+    """Frames whose pixels are in no file, for lack of room on the disk or of time; of the messages
+    `not_recorded`."""
 
 
 @dataclass(frozen=True, slots=True)

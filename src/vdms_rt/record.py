@@ -44,6 +44,8 @@ class RecordCounters:
     """Messages on the disk."""
     not_recorded: int
     """Messages that are in no file and never will be."""
+    pixels_left_out: int
+    """Of these the pixels, one for each frame: the disk had no room for them, or no time."""
     queued: int
     fsync_ms: float
     """The slowest flush to disk since the counters were last asked for, one under way included."""
@@ -162,6 +164,7 @@ class Recorder:
             counters = RecordCounters(
                 recorded=self._recorded,
                 not_recorded=self._backlog.lost_messages,
+                pixels_left_out=self._backlog.lost_pixels,
                 queued=len(self._backlog),
                 fsync_ms=max(self._fsync_ms, under_way_ms),
                 disk_free_bytes=self._shelf.free_bytes,

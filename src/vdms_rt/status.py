@@ -46,6 +46,11 @@ def status_line(health: Health, newest: Displacement | None) -> str:
     return "  ".join(parts)
 
 
+def not_recorded(messages: int, pixels: int) -> str:
+    """Return in words how many messages are in no file, and of how many frames the pixels."""
+    return f"{messages} messages" + (f", of them the pixels of {pixels} frames" if pixels else "")
+
+
 def summary(health: Health, files: Sequence[str]) -> str:
     """Return the account of a finished run, a line for each figure."""
     rows = [
@@ -57,7 +62,7 @@ def summary(health: Health, files: Sequence[str]) -> str:
         ("overwritten", f"{health.overwritten} frames that came faster than they were measured"),
         ("measured", f"{health.measured} samples"),
         ("invalid", f"{health.invalid} samples after the reference without a position"),
-        ("not recorded", f"{health.not_recorded} messages"),
+        ("not recorded", not_recorded(health.not_recorded, health.pixels_left_out)),
     ]
     always = ("captured", "missed", "measured", "invalid")
     lines = [

@@ -13,7 +13,7 @@ from replaying import PERIOD_NS, RATE_HZ, write_recording
 
 import vdms_replay
 from vdms_replay.cli import run
-from vdms_replay.info import info
+from vdms_replay.info import info, page
 from vdms_replay.summary import Axis
 from vdms_rt.logfile.reader import LogReader
 from vdms_rt.logfile.writer import LogWriter
@@ -55,6 +55,16 @@ def test_info_tells_rate_gaps_reasons_and_peaks(recording):
     assert told["pixel_frames"] == 146
     assert told["events"][0]["text"] == "a frame was missed"
     assert told["counters"]["captured"] == 0
+
+
+def test_pixels_left_out_are_told_where_there_are_any(tmp_path):
+    counted = {"not_recorded": 12, "pixels_left_out": 7}
+    told = info(write_recording(tmp_path / "a.mcap", range(90), finish=False, health=counted))
+    assert (told["counters"]["not_recorded"], told["counters"]["pixels_left_out"]) == (12, 7)
+    assert "not recorded 12, pixels left out 7" in page(told)
+    whole = info(write_recording(tmp_path / "b.mcap", range(90), finish=False))
+    assert whole["counters"]["pixels_left_out"] == 0
+    assert "pixels left out" not in page(whole)
 
 
 def test_info_over_many_batches_is_that_of_one(tmp_path, monkeypatch, recording):

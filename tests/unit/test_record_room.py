@@ -110,6 +110,7 @@ def test_with_little_room_pixels_go_first_and_come_back(tmp_path, free):
             assert not put_pixels(recorder, number)
         assert not put_checkpoint(recorder, 10)
         assert recorder.counters().not_recorded == 11
+        assert recorder.counters().pixels_left_out == 10
         assert recorder.counters().disk_free_bytes == 99_000_000
         assert recorder.counters().trouble == ""
         assert "not-recorded" not in told.codes()
@@ -125,6 +126,17 @@ def test_with_little_room_pixels_go_first_and_come_back(tmp_path, free):
     assert [m.frame_seq for topic, _, m in messages if topic == PIXELS] == [0, 11]
     codes = [m.code for topic, _, m in messages if topic == EVENTS]
     assert [c for c in codes if c.startswith("room")] == ["room-low", "room-again"]
+
+
+def test_pixels_that_the_queue_has_no_room_for_are_counted(tmp_path, free):
+    recorder, _ = recorder_for(tmp_path, queue_messages=64)
+    assert sum(put_pixels(recorder, number) for number in range(60)) == 48
+    assert sum(put_sample(recorder, seq) for seq in range(20)) == 16
+    counters = recorder.counters()
+    assert (counters.not_recorded, counters.pixels_left_out) == (16, 12)
+    with running(recorder):
+        pass
+    assert recorder.counters().pixels_left_out == 12
 
 
 def test_pixels_left_out_to_the_very_end_are_in_the_file_by_number(tmp_path, free):

@@ -137,4 +137,6 @@ def _station_line(name: str, station: StationView) -> Text:
             line.append(f"  recording {health.recording}")
         else:
             line.append("  not recording", style="dim")
+        if health.pixels_left_out:
+            line.append(f"  without pixels of {health.pixels_left_out} frames", style="yellow")
     return line

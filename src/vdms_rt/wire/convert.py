@@ -204,6 +204,7 @@ def health_message(h: Health) -> pb.Health:
         utc_state=h.utc_state,
         repeated=h.repeated,
         no_signal=h.no_signal,
+        pixels_left_out=h.pixels_left_out,
     )
 
 

@@ -319,6 +319,7 @@ class Health(_message.Message):
     UTC_STATE_FIELD_NUMBER: _builtins.int
     REPEATED_FIELD_NUMBER: _builtins.int
     NO_SIGNAL_FIELD_NUMBER: _builtins.int
+    PIXELS_LEFT_OUT_FIELD_NUMBER: _builtins.int
     session: _builtins.int
     utc_ns: _builtins.int
     uptime_s: _builtins.float
@@ -346,6 +347,8 @@ class Health(_message.Message):
     utc_state: _builtins.str
     repeated: _builtins.int
     no_signal: _builtins.int
+    pixels_left_out: _builtins.int
+    """frames; part of not_recorded"""
     def __init__(
         self,
         *,
@@ -376,10 +379,11 @@ class Health(_message.Message):
         utc_state: _builtins.str = ...,
         repeated: _builtins.int = ...,
         no_signal: _builtins.int = ...,
+        pixels_left_out: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["captured", b"captured", "clock_jitter_us", b"clock_jitter_us", "clock_rate_ppm", b"clock_rate_ppm", "clock_sigma_us", b"clock_sigma_us", "damaged", b"damaged", "device", b"device", "disk_free_bytes", b"disk_free_bytes", "frame_rate_hz", b"frame_rate_hz", "fsync_ms", b"fsync_ms", "invalid", b"invalid", "measured", b"measured", "missed", b"missed", "no_signal", b"no_signal", "not_recorded", b"not_recorded", "overwritten", b"overwritten", "record_queue", b"record_queue", "record_trouble", b"record_trouble", "recording", b"recording", "repeated", b"repeated", "ring_used", b"ring_used", "sample_age_ms", b"sample_age_ms", "session", b"session", "state", b"state", "unsent", b"unsent", "uptime_s", b"uptime_s", "utc_ns", b"utc_ns", "utc_state", b"utc_state"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["captured", b"captured", "clock_jitter_us", b"clock_jitter_us", "clock_rate_ppm", b"clock_rate_ppm", "clock_sigma_us", b"clock_sigma_us", "damaged", b"damaged", "device", b"device", "disk_free_bytes", b"disk_free_bytes", "frame_rate_hz", b"frame_rate_hz", "fsync_ms", b"fsync_ms", "invalid", b"invalid", "measured", b"measured", "missed", b"missed", "no_signal", b"no_signal", "not_recorded", b"not_recorded", "overwritten", b"overwritten", "pixels_left_out", b"pixels_left_out", "record_queue", b"record_queue", "record_trouble", b"record_trouble", "recording", b"recording", "repeated", b"repeated", "ring_used", b"ring_used", "sample_age_ms", b"sample_age_ms", "session", b"session", "state", b"state", "unsent", b"unsent", "uptime_s", b"uptime_s", "utc_ns", b"utc_ns", "utc_state", b"utc_state"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

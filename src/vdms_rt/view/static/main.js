@@ -92,6 +92,7 @@ function show_station() {
     ["lost", `${lost} frames, ${health.invalid} invalid samples`, lost ? "warn" : ""],
     ["this page", page.skipped ? `skipped ${page.skipped}` : marker?.on_the_way ? `${marker.on_the_way} samples lost on the way` : "has every sample", page.skipped || marker?.on_the_way ? "warn" : ""],
     ["recording", health.record_trouble || health.recording.split("/").pop().replace(/\.mcap(\.part)?$/, "") || "no", health.record_trouble ? "bad" : ""],
+    ...(health.pixels_left_out ? [["left out", `the pixels of ${health.pixels_left_out} frames`, "warn"]] : []),
     ["disk left", bytes(health.disk_free_bytes), health.disk_free_bytes < 5e9 ? "warn" : ""],
     ["clock", `UTC ${health.utc_state}, ± ${plain(health.clock_sigma_us, 0)} µs`],
     ["age", `${plain(health.sample_age_ms, 0)} ms from light to number`],

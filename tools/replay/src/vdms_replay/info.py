@@ -25,6 +25,10 @@ from vdms_rt.wire import vdms_pb2 as pb
 
 LINES_TOLD = 12
 """Of gaps and of events: the page is for a person; --json tells all."""
+COUNTERS = (
+    "captured", "missed", "damaged", "overwritten", "measured", "invalid", "not_recorded",
+    "pixels_left_out",
+)  # fmt: skip
 SEVERITIES = {0: "info", 1: "warning", 2: "error"}
 
 
@@ -164,8 +168,7 @@ def _counters(about: About, health: pb.Health | None) -> dict[str, int]:
     last = _last_health(about, health)
     if last is None:
         return {}
-    names = ("captured", "missed", "damaged", "overwritten", "measured", "invalid", "not_recorded")
-    return {name: int(getattr(last, name)) for name in names}
+    return {name: int(getattr(last, name)) for name in COUNTERS}
 
 
 def page(told: dict[str, Any]) -> str:
@@ -255,7 +258,11 @@ def _trouble(told: dict[str, Any]) -> list[str]:
     counters = told["counters"]
     lines = [""]
     if counters:
-        text = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counters.items())
+        text = ", ".join(
+            f"{name.replace('_', ' ')} {count}"
+            for name, count in counters.items()
+            if count or name != "pixels_left_out"
+        )
         lines.append(_line("frames", text))
     lines.append(_line("clock", _clock_text(told["clock"])))
     severities = Counter(event["severity"] for event in told["events"])

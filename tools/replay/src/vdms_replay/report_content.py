@@ -308,9 +308,8 @@ def _comparison(one: Comparison) -> list[Block]:
             "Amplitudes in the table of frequencies are means over all that was compared; a motion "
             "that does not last all the time shows less.",
         ),
-        Facts([(name[:1].upper() + name[1:], text.replace("+-", "±").replace(" um", " µm"))
-               for name, text in compare.rows(one)]),
-    ]  # fmt: skip
+        Facts([(name[:1].upper() + name[1:], _in_print(text)) for name, text in compare.rows(one)]),
+    ]
     if one.spectrum is not None and one.spectrum.lines:
         blocks.append(
             Table(
@@ -337,6 +336,13 @@ def _comparison(one: Comparison) -> list[Block]:
         )
     blocks += [Words(f"Note: {sentence}.") for sentence in compare.hints(one)]
     return blocks
+
+
+def _in_print(text: str) -> str:
+    """Return a terminal's text with the signs that print has."""
+    for plain, sign in (("+-", "±"), (" um", " µm"), (" us", " µs")):
+        text = text.replace(plain, sign)
+    return text
 
 
 def _picture(recording: Recording, chosen: Chosen) -> list[Block]:
