@@ -17,20 +17,25 @@ BENCH = Bench(distance_m=8.0, angle_deg=30.0)
 NODES, WEIGHTS = (v / 2 for v in np.polynomial.legendre.leggauss(12))
 
 
-def exposed(x_mm: float, velocity: float, acceleration: float) -> np.ndarray:
+def exposed(x_mm: float, velocity: float, acceleration: float, bench: Bench = BENCH) -> np.ndarray:
     """The mean picture of a marker on a parabola through x_mm in the middle of the exposure."""
     t = NODES * EXPOSURE_S
     places = x_mm + velocity * t + acceleration * t * t / 2
-    return sum(w * BENCH.still(float(x)) for x, w in zip(places, WEIGHTS, strict=True))
+    return sum(w * bench.still(float(x)) for x, w in zip(places, WEIGHTS, strict=True))
+
+
+def learnt_of(bench: Bench):
+    rng = np.random.default_rng(1)
+    rest, work = bench.still(), Workspace()
+    half = (44 * np.cos(np.radians(bench.angle_deg)), 42.0)
+    found = first_look(tuple(map(tuple, bench.centres_px().tolist())), (half,) * 4)
+    stills = [study(grabbed(rest, 0.5, rng), 0, 1, found, first_slow(4), work) for _ in range(12)]
+    return learn({0: stills}, 1)[0]
 
 
 @pytest.fixture(scope="module")
 def learnt():
-    rng = np.random.default_rng(1)
-    rest, work = BENCH.still(), Workspace()
-    found = first_look(tuple(map(tuple, BENCH.centres_px().tolist())), ((38.0, 42.0),) * 4)
-    stills = [study(grabbed(rest, 0.5, rng), 0, 1, found, first_slow(4), work) for _ in range(8)]
-    return learn({0: stills}, 1)[0]
+    return learnt_of(BENCH)
 
 
 @pytest.mark.parametrize("smeared", [False, True])
@@ -62,6 +67,29 @@ def test_the_centre_is_that_of_the_mean_over_the_exposure(learnt, velocity, acce
     assert not any(flags)
 
 
+@pytest.mark.parametrize(
+    ("velocity", "acceleration"), [(314.0, 0.0), (-314.0, 0.0), (222.0, -6979.0)]
+)
+def test_a_long_way_seen_at_a_slant(velocity, acceleration):
+    """The ellipse is narrow along its way, and the way's far half looks shorter: 0.0014 px here."""
+    bench = Bench(distance_m=4.0, angle_deg=60.0)
+    appearance, _ = learnt_of(bench)
+    rng, work = np.random.default_rng(2), Workspace()
+    clean = exposed(2.0, velocity, acceleration, bench)
+    forecast = Forecast(appearance, bench.homography, EXPOSURE_S)
+    expected = forecast.at((2.0, 0, 0), (velocity, 0, 0), (acceleration, 0, 0))
+    assert expected.smeared
+    slow = Slow(appearance.variance_grey2, appearance.edge_px, 1)
+    centres = []
+    for _ in range(30):
+        readings, _ = measure(grabbed(clean, 0.5, rng), 0, 1, expected, slow, work)
+        centres.append(
+            [(r.x_px + x, r.y_px) for r, (x, _) in zip(readings, expected.shift_px, strict=True)]
+        )
+    error = np.mean(centres, axis=0) - bench.centres_px(2.0 + acceleration * EXPOSURE_S**2 / 24)
+    assert abs(error[:, 0].mean()) < 0.0004
+
+
 def test_the_tables_begin_at_rest_and_end_where_light_leads():
     for smeared in (False, True):
         rest = smear(0.0, smeared)
@@ -75,6 +103,11 @@ def test_the_tables_begin_at_rest_and_end_where_light_leads():
     # A short way adds 1/12 of its square to the light, and half of that to the weighed edge.
     assert smear(1.0, smeared=False).moment_along == pytest.approx(1 / 24, rel=0.05)
     assert smear(8.0, smeared=True).missing_along < smear(8.0, smeared=False).missing_along / 3
+    # A line across the way has nothing but the straight edge's; one along it has almost nothing.
+    ellipses = [smear(4.0, False, aspect).missing_along for aspect in (0.25, 0.5, 1.0, 2.0, 4.0)]
+    assert ellipses == sorted(ellipses)
+    assert ellipses[0] * 1.5 < ellipses[2]
+    assert ellipses[2] * 1.15 < ellipses[4]
 
 
 def test_a_gate_that_does_not_reach_its_circle_gives_none(learnt):

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 
@@ -175,9 +176,8 @@ def _course(
 ) -> Course:
     """Return how a marker moves now that its circles are seen: all of them lie as far from where
     they were foretold as the one in the middle."""
-    n = len(readings) // 2
-    away_x = sorted(r.x_px - x for r, x in zip(readings, expected.x_px, strict=True))[n]
-    away_y = sorted(r.y_px - y for r, y in zip(readings, expected.y_px, strict=True))[n]
+    away_x = median(r.x_px - x for r, x in zip(readings, expected.x_px, strict=True))
+    away_y = median(r.y_px - y for r, y in zip(readings, expected.y_px, strict=True))
     shift_x, shift_y = expected.shift_px[0]
     away_x, away_y = away_x + shift_x, away_y + shift_y
     (a, b), (c, d) = mm_per_px(watch, foretold.pose)

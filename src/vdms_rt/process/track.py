@@ -63,11 +63,12 @@ class Track(NamedTuple):
         step_ns = t_last - poses[-2][0]
         if abs(t_ns - t_last - step_ns) > EVEN * step_ns:
             return _parabola(poses[-3:], t_ns)
-        terms = _terms(poses)
+        per_s = 1e9 / step_ns
+        series = _series(poses)
         return Course(
-            _sum(terms, [1.0] * MOST_POSES, 1.0),
-            _sum(terms, _SLOPE_AHEAD, 1e9 / step_ns),
-            _sum(terms, _BEND_AHEAD, (1e9 / step_ns) ** 2),
+            _sums(series, [1.0] * MOST_POSES, 1.0),
+            _sums(series, _SLOPE_AHEAD, per_s),
+            _sums(series, _BEND_AHEAD, per_s * per_s),
         )
 
     def now(self, t_ns: int, pose: Pose) -> Course:
@@ -75,14 +76,13 @@ class Track(NamedTuple):
         poses = _before(self.poses, t_ns)
         if not poses:
             return Course(pose)
-        terms = _terms([*poses, (t_ns, pose)][-MOST_POSES:])
+        series = _series([*poses, (t_ns, pose)][-MOST_POSES:])
         per_s = 1e9 / (t_ns - poses[-1][0])
-        bend = _BEND_NOW[len(terms) - 1] * per_s * per_s
         return Course(
             pose,
-            _sum(terms, _SLOPE_NOW, per_s),
-            _sum(terms, _BEND_NOW, per_s * per_s),
-            _doubt(terms[-2:], bend),
+            _sums(series, _SLOPE_NOW, per_s),
+            _sums(series, _BEND_NOW, per_s * per_s),
+            _doubts(series, per_s * per_s),
         )
 
 
@@ -99,26 +99,30 @@ def _before(poses: tuple[tuple[int, Pose], ...], t_ns: int) -> list[tuple[int, P
     return leading[::-1]
 
 
-def _terms(poses: list[tuple[int, Pose]]) -> list[Pose]:
-    """Return the last pose and its backward differences, as far as each is smaller than the larger
-    of the two before it (any one of a harmonic's may be near 0); two at most if none is. Only poses
-    that are evenly spaced up to the last one count."""
+def _series(poses: list[tuple[int, Pose]]) -> tuple[list[float], list[float], list[float]]:
+    """Return the terms of x, y and rotation. Only poses that are evenly spaced up to the last one
+    count."""
     step_ns = poses[-1][0] - poses[-2][0]
-    row = [poses[-1][1]]
+    even = [poses[-1][1]]
     later_ns = poses[-1][0]
     for t_ns, pose in reversed(poses[:-1]):
         if abs(later_ns - t_ns - step_ns) > EVEN * step_ns:
             break
-        row.append(pose)
+        even.append(pose)
         later_ns = t_ns
+    x, y, r = ([*values] for values in zip(*even, strict=True))
+    return _terms(x), _terms(y), _terms(r)
+
+
+def _terms(row: list[float]) -> list[float]:
+    """Return the first of the values, which is the latest, and its backward differences, as far as
+    each is smaller than the larger of the two before it (any one of a harmonic's may be near 0):
+    beyond that there is only noise. Two at most if none is."""
     terms = [row[0]]
     sizes = [math.inf, math.inf]
     while len(row) > 1:
-        row = [
-            (ax - bx, ay - by, ar - br) for (ax, ay, ar), (bx, by, br) in itertools.pairwise(row)
-        ]
-        x, y, _ = row[0]
-        size = x * x + y * y
+        row = [later - earlier for later, earlier in itertools.pairwise(row)]
+        size = abs(row[0])
         if size >= max(sizes[-2:]) and len(terms) > 2:
             break
         sizes.append(size)
@@ -126,21 +130,22 @@ def _terms(poses: list[tuple[int, Pose]]) -> list[Pose]:
     return terms
 
 
-def _sum(terms: list[Pose], factors: list[float], scale: float) -> Pose:
-    x = y = r = 0.0
-    for (tx, ty, tr), factor in zip(terms, factors, strict=False):
-        x += tx * factor
-        y += ty * factor
-        r += tr * factor
-    return x * scale, y * scale, r * scale
+def _sums(series: tuple[list[float], ...], factors: list[float], scale: float) -> Pose:
+    x, y, r = (
+        scale * sum(term * factor for term, factor in zip(terms, factors, strict=False))
+        for terms in series
+    )
+    return x, y, r
 
 
-def _doubt(last: list[Pose], scale: float) -> Pose:
-    """Return how large the first term that was left out may be. Any one term of a harmonic may be
-    near 0, so it is told by two."""
-    (ax, ay, ar), (bx, by, br) = last
-    x, y, r = (max(abs(a) / 2, abs(b)) for a, b in ((ax, bx), (ay, by), (ar, br)))
-    return x * scale, y * scale, r * scale
+def _doubts(series: tuple[list[float], ...], per_s2: float) -> Pose:
+    """Return how large the first term of the bend that was left out may be. Any one term of a
+    harmonic may be near 0, so it is told by two."""
+    x, y, r = (
+        max(abs(terms[-2]) / 2, abs(terms[-1])) * _BEND_NOW[len(terms) - 1] * per_s2
+        for terms in series
+    )
+    return x, y, r
 
 
 def _parabola(poses: list[tuple[int, Pose]], t_ns: int) -> Course:
