@@ -17,7 +17,7 @@ from vdms_rt.process.progress import Phase, Plan
 from vdms_rt.process.step import begin, step
 
 PERIOD_NS = 33_366_667
-STILLS = 30
+STILLS = 60
 REGION_PX = 10.0
 """Of a region beyond what its circle reaches, where the neighbours leave so much."""
 
