@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tools.bench.film import Film, Way
+from tools.bench.picture import Bench, grabbed
 from tools.bench.sigma import (
     Case,
     coverage_table,
@@ -16,6 +18,7 @@ from tools.bench.sigma import (
     still_table,
     time_table,
 )
+from tools.bench.stage import PERIOD_NS, Stage
 
 
 def test_sigma_is_true_in_motion_and_from_the_start() -> None:
@@ -36,6 +39,26 @@ def test_sigma_is_true_in_motion_and_from_the_start() -> None:
     assert 0.4 < rms(time_error / sigma_t) < 1.6
     assert all(r.counted == r.lost and r.wrong_index == 0 for r in runs)
     assert len(coverage_table(runs).rows) == 12
+
+
+def test_the_first_picture_of_a_sudden_start_has_the_times_share() -> None:
+    bench = Bench(distance_m=8.0, angle_deg=30.0)
+    stage = Stage(bench, Film(bench, Way(6.0)), "smooth", "frame")
+    rng = np.random.default_rng(1)
+    stills = [grabbed(bench.still(), 2.0, rng) for _ in range(8)]
+    n = 0
+    while not stage.measuring:
+        stage.show(n, stills[n % len(stills)])
+        n += 1
+    sigma_t_ns = 200_000
+    (still,) = stage.show(n, stills[0], sigma_t_ns=sigma_t_ns)
+    (start,) = stage.show(n + 1, grabbed(bench.still(5.0), 2.0, rng), sigma_t_ns=sigma_t_ns)
+    assert still.valid
+    assert start.valid
+    assert start.x_mm == pytest.approx(5.0, abs=0.02)
+    velocity_mm_s = 5.0 / (PERIOD_NS / 1e9)
+    assert start.sigma_x_mm > 0.9 * velocity_mm_s * sigma_t_ns / 1e9
+    assert still.sigma_x_mm < start.sigma_x_mm / 5
 
 
 def test_times_and_what_they_cost() -> None:

@@ -148,7 +148,9 @@ def _smooth(
     covariance = position_covariance(motion, view.zero_mm, view.covariance_mm2)
     off_x, off_y = watch.uneven.of(picture.kind)
     now: Pose = (motion.x_mm - off_x, motion.y_mm - off_y, motion.rotation_mrad)
-    seen = Seen(circles, now, covariance, motion.residual_mm, course.velocity, status)
+    # With this picture in it, so that a sudden start is not missed.
+    velocity = watch.track.now(picture.t_ns, now).velocity
+    seen = Seen(circles, now, covariance, motion.residual_mm, velocity, status)
     track = watch.track.with_pose(picture.t_ns, now) if observation.agree else watch.track
     after = dataclasses.replace(
         watch,
