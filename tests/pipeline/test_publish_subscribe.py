@@ -32,6 +32,7 @@ from vdms_rt.publish import Publisher, PublishError
 from vdms_rt.subscribe import (
     Arrived,
     Left,
+    Listener,
     Missed,
     Notice,
     Sample,
@@ -616,6 +617,57 @@ def test_callbacks(endpoint: str) -> None:
     assert listener.wait(0.0)
     assert got == [*range(40), *range(50, 60)]
     assert missed(told) == [Missed("s1", "m1", 7, 40, 49, on_the_way=0)]
+
+
+def test_a_callback_that_hangs_holds_up_nobody_and_is_told_what_did_not_fit(
+    endpoint: str,
+) -> None:
+    got: list[int] = []
+    told: list[Notice] = []
+    go_on, done = threading.Event(), threading.Event()
+
+    def on_sample(sample: Sample) -> None:
+        got.append(sample.value.seq)
+        go_on.wait(DEADLINE_S)
+        if got[-1] >= 2000:
+            done.set()
+
+    with (
+        publisher(endpoint) as station,
+        subscribe(connect=endpoint, queue=100, on_sample=on_sample, on_notice=told.append),
+        subscribe(connect=endpoint, notices=True) as other,
+    ):
+        say(station, *range(2000))
+        samples, notices = receive(other, 1999)
+        assert [s.seq for s in samples] == list(range(2000))
+        assert missed(notices) == []
+        go_on.set()
+        for seq in range(2000, 2500):
+            say(station, seq)
+            if done.wait(0.05):
+                break
+        assert done.is_set()
+    gone = [seq for m in missed(told) for seq in range(m.first_seq, m.last_seq + 1)]
+    assert gone
+    assert got == sorted(got)
+    assert sorted(got + gone) == list(range(got[-1] + 1))
+
+
+def test_a_callback_may_close_its_listener(endpoint: str) -> None:
+    got: list[int] = []
+    box: list[Listener] = []
+
+    def on_sample(sample: Sample) -> None:
+        got.append(sample.value.seq)
+        if got[-1] == 3:
+            box[0].close()
+
+    with publisher(endpoint) as station:
+        box.append(subscribe(connect=endpoint, on_sample=on_sample))
+        say(station, *range(10))
+        assert box[0].wait(DEADLINE_S)
+        box[0].close()
+    assert got == [0, 1, 2, 3]
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")

@@ -6,7 +6,8 @@ with `vdms_rt.subscribe(on_sample=...)`; and beside them, in the same run, a bar
 bare zenoh subscriber with messages of the same size at the same rate. All stamps are of one
 monotonic clock. `measuring` is the time from the moment the process stage has the frame to the
 finished sample (for the second field of a frame that includes the first one's). The ratio is
-(total - measuring) / bare, of the medians.
+(total - measuring) / bare, of the medians. `with values` ends not when the callback begins but when
+it has read the sample's values, which no bare subscriber has.
 
     python -m tools.bench.latency [--minutes 10] [--loads idle busy] [--fifo] [--json]
 
@@ -148,13 +149,13 @@ def feed(ring: Ring, scene: Scene, ended: threading.Event) -> None:
 
 
 def reader(out: Path, ended: threading.Event, ready: Callable[[], None]) -> None:
-    came: list[tuple[int, int]] = []
+    came: list[tuple[int, int, int]] = []
     ready()
 
     def on_sample(sample: Sample) -> None:
         now_ns = time.monotonic_ns()
         if isinstance(sample.value, Displacement):
-            came.append((sample.value.seq, now_ns))
+            came.append((sample.value.seq, now_ns, time.monotonic_ns()))
 
     with subscribe(
         "vdms/*/*/displacement", f"tcp/127.0.0.1:{PORTS['station']}", on_sample=on_sample
@@ -261,14 +262,19 @@ def table(stamps: dict[str, Stamps]) -> dict[str, list[float]]:
     # The bare reader starts last.
     since_ns = stamps["bare_reader"][0, 1] + SETTLE_S * 1e9
     said = {int(seq): (hand, taken, done) for seq, _, hand, done, taken in frames}
-    came = [(*said[int(seq)], at) for seq, at in stamps["reader"] if said[int(seq)][0] > since_ns]
-    hand, taken, done, at = np.array(came, dtype=np.int64).T
+    came = [
+        (*said[int(seq)], at, read)
+        for seq, at, read in stamps["reader"]
+        if said[int(seq)][0] > since_ns
+    ]
+    hand, taken, done, at, read = np.array(came, dtype=np.int64).T
     put = dict(stamps["bare_put"].tolist())
     bare = np.array([at - put[n] for n, at in stamps["bare_reader"] if put[n] > since_ns])
     spent = {
         "total": at - hand,
         "measuring": done - taken,
         "the rest": (at - hand) - (done - taken),
+        "with values": (read - hand) - (done - taken),
         "bare zenoh": bare,
     }
     return {

@@ -14,50 +14,20 @@ from typing import NamedTuple
 
 import zenoh
 from zenoh import ext
-from zenoh.handlers import Callback
+from zenoh.handlers import Callback, RingChannel
 
+from vdms_rt.subscribe.inbox import Inbox
 from vdms_rt.subscribe.samples import SOURCES_REMEMBERED, Arrived, Left, Raw
 from vdms_rt.wire.session import SESSION, reason
 from vdms_rt.wire.topics import ALIVE_KEY
 
 CONNECT_TIMEOUT_S = 1.0
+EAR_S = 1.0
+"""How long an interpreter that exits waits for a callback."""
 RETRY_S = 0.2
 HISTORY_TIMEOUT_S = 10.0
 
 log = logging.getLogger("vdms_rt.subscribe")
-
-
-class Inbox:
-    """Where the links put what comes; it never makes them wait."""
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        # Wakes its reader in two thirds of the time that a Condition takes.
-        self._waiting: queue.SimpleQueue[Raw | Arrived | Left | None] = queue.SimpleQueue()
-        self.closed = False
-
-    def put(self, item: Raw | Arrived | Left) -> None:
-        """Add it, or drop a message when `limit` items wait: the reader then finds the gap."""
-        if self._waiting.qsize() < self._limit or not isinstance(item, Raw):
-            self._waiting.put(item)
-
-    def take(self, timeout_s: float | None) -> Raw | Arrived | Left | None:
-        """Return the oldest item, or None if none came in time or the inbox is closed."""
-        if self.closed:
-            return None
-        try:
-            item = self._waiting.get(timeout=timeout_s)
-        except queue.Empty:
-            return None
-        if item is None or self.closed:
-            self._waiting.put(None)  # for whoever else waits
-            return None
-        return item
-
-    def close(self) -> None:
-        """Let go whoever waits."""
-        self.closed = True
-        self._waiting.put(None)
 
 
 class _Request(NamedTuple):
@@ -139,7 +109,7 @@ class Link:
 
     def _serve(self, session: zenoh.Session) -> None:
         # The interpreter's exit hangs on a zenoh callback that is still declared, so all are
-        # undeclared here, in order. They run in zenoh's own thread: they only fill the inbox.
+        # undeclared here, in order. Callbacks run in zenoh's own thread: they only fill the inbox.
         with contextlib.ExitStack() as stack:
             stack.enter_context(session)
             for key in {_alive_key(key) for key in self._keys}:
@@ -149,30 +119,49 @@ class Link:
                     )
                 )
             for key in self._keys:
-                stack.enter_context(
-                    ext.declare_advanced_subscriber(
-                        session,
-                        key,
-                        Callback(self._on_sample, indirect=False),
-                        recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-                    )
-                )
+                self._listen(session, key, stack)
             self._session = session
             while (request := self._requests.get()) is not None:
                 self._fetch(session, request)
             self._session = None
 
-    def _on_sample(self, sample: zenoh.Sample) -> None:
+    def _listen(self, session: zenoh.Session, key: str, stack: contextlib.ExitStack) -> None:
+        """Subscribe until `stack` is closed."""
+        recovery = ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+        if self._inbox.at_once is None:
+            callback = Callback(self._on_sample, indirect=False)
+            stack.enter_context(
+                ext.declare_advanced_subscriber(session, key, callback, recovery=recovery)
+            )
+            return
+        # Full, it drops the oldest, so it never makes zenoh's thread wait.
+        channel: RingChannel[zenoh.Sample] = RingChannel(self._inbox.limit)
+        subscriber = ext.declare_advanced_subscriber(session, key, channel, recovery=recovery)
+        ear = threading.Thread(
+            target=self._hear,
+            args=(subscriber,),
+            name=f"subscribe {self.endpoint} {key}",
+            daemon=True,
+        )
+        ear.start()
+        stack.callback(ear.join, EAR_S)
+        stack.enter_context(subscriber)
+
+    def _hear(self, subscriber: ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]]) -> None:
+        for sample in subscriber:
+            self._on_sample(sample, patient=True)
+
+    def _on_sample(self, sample: zenoh.Sample, *, patient: bool = False) -> None:
         raw = _raw(sample)
         if not raw.sequenced:
-            self._inbox.put(raw)
+            self._inbox.put(raw, patient=patient)
             return
         with self._lock:
             if raw.source in self._held:
                 self._held[raw.source].append(raw)
             elif raw.source in self._known or raw.number == 0:
                 self._know(raw.source)
-                self._inbox.put(raw)
+                self._inbox.put(raw, patient=patient)
             else:
                 self._know(raw.source)
                 self._held[raw.source] = [raw]
@@ -237,18 +226,18 @@ def _alive_key(key: str) -> str:
 
 def _raw(sample: zenoh.Sample) -> Raw:
     info = sample.source_info
-    stamp = sample.timestamp
     if info is not None:
-        source, number = f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn
-    elif stamp is not None:
+        by = info.source_id
+        source, number = f"{by.zid}/{by.eid}", info.source_sn
+    elif (stamp := sample.timestamp) is not None:
         source, number = bytes(stamp.get_id()).hex(), stamp.get_time_as_ntp64().as_nanos()
     else:
         source, number = "", 0
     return Raw(
-        key=str(sample.key_expr),
-        data=sample.payload.to_bytes(),
-        received_ns=time.monotonic_ns(),
-        source=source,
-        number=number,
-        sequenced=info is not None,
+        str(sample.key_expr),
+        sample.payload.to_bytes(),
+        time.monotonic_ns(),
+        source,
+        number,
+        info is not None,
     )

@@ -10,6 +10,7 @@ from google.protobuf.message import DecodeError, Message
 
 from vdms_rt.model import Displacement, Event, Health, Truth
 from vdms_rt.wire import convert
+from vdms_rt.wire import vdms_pb2 as pb
 from vdms_rt.wire.topics import DISPLACEMENT, EVENT, HEALTH, TOPICS, TRUTH
 
 SOURCES_REMEMBERED = 4096
@@ -17,7 +18,10 @@ SN_RANGE = 1 << 32
 """zenoh's sequence numbers wrap."""
 
 
-@dataclass(frozen=True, slots=True)
+Value: TypeAlias = Displacement | Truth | Health | Event | Message | bytes
+
+
+@dataclass(frozen=True, slots=True, repr=False)
 class Sample:
     """One message of a station."""
 
@@ -26,10 +30,25 @@ class Sample:
     """Empty where the topic is of the whole station."""
     topic: str
     received_ns: int
-    """When it came, on this computer's monotonic clock."""
-    value: Displacement | Truth | Health | Event | Message | bytes
-    """The message of the topic (`vdms_pb2`) where there is no type of ours, the bytes where the
-    topic is not known."""
+    """When it came, on this computer's monotonic clock; what came while a callback ran, when that
+    returned at the latest."""
+    _value: Value | pb.Displacement
+
+    @property
+    def value(self) -> Value:
+        """The message of the topic (`vdms_pb2`) where there is no type of ours, the bytes where the
+        topic is not known. A displacement is made of its message when it is first asked for."""
+        value = self._value
+        if isinstance(value, pb.Displacement):
+            value = convert.displacement_of(value)
+            object.__setattr__(self, "_value", value)
+        return value
+
+    def __repr__(self) -> str:
+        return (
+            f"Sample(station={self.station!r}, marker={self.marker!r}, topic={self.topic!r}, "
+            f"received_ns={self.received_ns}, value={self.value!r})"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,15 +129,20 @@ class Reader:
     def __init__(self) -> None:
         self._last: dict[tuple[str, str], tuple[int, Raw]] = {}
 
-    def read(self, raw: Raw) -> Iterator[Sample | Notice]:
-        """Return the sample, and before it what is missing there; nothing for a double."""
+    def read(self, item: Raw | Arrived | Left) -> Iterator[Sample | Notice]:
+        """Return the sample, and before it what is missing there; nothing for a double. What is
+        not a message comes back as it is."""
+        if not isinstance(item, Raw):
+            yield item
+            return
+        raw = item
         station, marker, topic = _parts(raw.key)
         try:
             value = _decode(topic, raw.data)
         except (DecodeError, ValueError) as error:
             yield Unreadable(raw.key, str(error))
             return
-        if isinstance(value, Displacement):
+        if isinstance(value, pb.Displacement):
             of, seq = (raw.key, str(value.session)), value.seq
         else:
             of, seq = (raw.key, raw.source), raw.number
@@ -126,7 +150,7 @@ class Reader:
         if last_seq is not None and seq <= last_seq:
             return
         self._remember(of, seq, raw)
-        if isinstance(value, Displacement) and last_seq is not None and seq > last_seq + 1:
+        if isinstance(value, pb.Displacement) and last_seq is not None and seq > last_seq + 1:
             yield Missed(
                 station,
                 marker,
@@ -161,15 +185,15 @@ def _parts(key: str) -> tuple[str, str, str]:
 
 
 _MESSAGES = {topic.name: topic.message for topic in TOPICS}
-_VALUES: dict[str, Callable[[bytes], Displacement | Truth | Health | Event]] = {
-    DISPLACEMENT.name: convert.displacement_from,
+_VALUES: dict[str, Callable[[bytes], pb.Displacement | Truth | Health | Event]] = {
+    DISPLACEMENT.name: convert.displacement_message,
     TRUTH.name: convert.truth_from,
     HEALTH.name: convert.health_from,
     EVENT.name: convert.event_from,
 }
 
 
-def _decode(topic: str, data: bytes) -> Displacement | Truth | Health | Event | Message | bytes:
+def _decode(topic: str, data: bytes) -> Value | pb.Displacement:
     if topic in _VALUES:
         return _VALUES[topic](data)
     return _MESSAGES[topic].FromString(data) if topic in _MESSAGES else data

@@ -14,8 +14,9 @@ from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
 import zenoh
 
 from vdms_rt.model import VdmsError
-from vdms_rt.subscribe.link import Inbox, Link
-from vdms_rt.subscribe.samples import Missed, Notice, Raw, Reader, Sample, Unreadable
+from vdms_rt.subscribe.inbox import Inbox, Incoming
+from vdms_rt.subscribe.link import Link
+from vdms_rt.subscribe.samples import Missed, Notice, Reader, Sample, Unreadable
 from vdms_rt.wire.session import DEFAULT_ENDPOINT, endpoint_fault, reason
 
 QUEUE = 65536
@@ -78,47 +79,38 @@ class Subscription(Generic[Item]):
         until_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             while self._ready and not self._inbox.closed:
-                item = self._ready.popleft()
-                if isinstance(item, Sample) or self._notices:
-                    return cast("Item", item)
-                self._tell(item)
+                said = self._ready.popleft()
+                if isinstance(said, Sample) or self._notices:
+                    return cast("Item", said)
+                _tell(said, self._on_notice)
             left_s = None if until_s is None else max(0.0, until_s - time.monotonic())
-            raw = self._inbox.take(left_s)
-            if raw is None:
+            item = self._inbox.take(left_s)
+            if item is None:
                 return None
-            self._ready.extend(self._reader.read(raw) if isinstance(raw, Raw) else (raw,))
+            self._ready.extend(self._reader.read(item))
 
     @property
     def waiting_for(self) -> tuple[str, ...]:
         """The addresses where nobody answers at the moment."""
-        return tuple(link.endpoint for link in self._links if not link.connected)
+        return _silent(self._links)
 
     def close(self) -> None:
         """End it; whoever waits in it is let go. May be called twice, and by any thread."""
         self._inbox.close()
-        for link in self._links:
-            link.stop()
-        for link in self._links:
-            link.join()
-
-    def _tell(self, notice: Notice) -> None:
-        if self._on_notice is not None:
-            self._on_notice(notice)
-        elif isinstance(notice, (Missed, Unreadable)):
-            log.warning("%s", notice)
+        _stop(self._links)
 
 
 class Listener:
-    """Calls back from a thread of its own with each sample, in order, until `close`.
+    """Calls back with each sample, in order, one at a time, until `close`.
 
-    An exception of a callback ends it: its traceback is printed, and `wait` returns.
+    It calls from the thread that receives the samples, or, as long as a callback takes more than
+    5 ms, from one more; none of them is zenoh's, so a callback may take its time. An exception of
+    a callback ends it: its traceback is printed, and `wait` returns.
     """
 
-    def __init__(
-        self, subscription: Subscription[Sample], on_sample: Callable[[Sample], object]
-    ) -> None:
-        self._subscription = subscription
-        self._on_sample = on_sample
+    def __init__(self, inbox: Inbox, links: Sequence[Link]) -> None:
+        self._inbox = inbox
+        self._links = links
         self._thread = threading.Thread(target=self._listen, name="subscribe", daemon=True)
         self._thread.start()
 
@@ -136,7 +128,7 @@ class Listener:
     @property
     def waiting_for(self) -> tuple[str, ...]:
         """The addresses where nobody answers at the moment."""
-        return self._subscription.waiting_for
+        return _silent(self._links)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until it has ended and return whether it has."""
@@ -144,15 +136,39 @@ class Listener:
         return not self._thread.is_alive()
 
     def close(self) -> None:
-        """End it, and wait for a callback that is running. May be called twice."""
-        self._subscription.close()
-        if self._thread is not threading.current_thread():
+        """End it, and wait for a callback that is running, unless that is who closes it. May be
+        called twice."""
+        self._inbox.close()
+        if not self._inbox.serving:
+            self._inbox.finish()
             self._thread.join()
 
     def _listen(self) -> None:
-        with self._subscription:
-            for sample in self._subscription:
-                self._on_sample(sample)
+        try:
+            self._inbox.serve()
+        finally:
+            self._inbox.close()
+            _stop(self._links)
+
+
+class _Caller:
+    """What a `Listener` does with an item; one thread at a time uses it."""
+
+    def __init__(
+        self,
+        on_sample: Callable[[Sample], object],
+        on_notice: Callable[[Notice], object] | None,
+    ) -> None:
+        self._on_sample = on_sample
+        self._on_notice = on_notice
+        self._reader = Reader()
+
+    def __call__(self, item: Incoming) -> None:
+        for said in self._reader.read(item):
+            if isinstance(said, Sample):
+                self._on_sample(said)
+            else:
+                _tell(said, self._on_notice)
 
 
 @overload
@@ -195,8 +211,7 @@ def subscribe(
     `key` is one zenoh key expression or several; `connect` is a station's or a router's address,
     or one for each of several stations. First come the samples that the station keeps from
     before the subscription (a minute, unless its `publish.recover_s` says otherwise). Up to
-    `queue` samples wait for a program that is slow; then the newest are dropped, and told as
-    missed.
+    `queue` samples wait for a program that is slow; then some are dropped, and told as missed.
 
     What was missed, and stations that arrive and leave, come between the samples with `notices`,
     go to `on_notice` in the thread that takes the samples, or else what was missed is logged as
@@ -217,10 +232,29 @@ def subscribe(
                 f'subscribe: "{one}" is not a key: {reason(error)}; '
                 'write for example "vdms/*/*/displacement"'
             ) from None
-    inbox = Inbox(queue)
+    inbox = Inbox(queue, None if on_sample is None else _Caller(on_sample, on_notice))
     links = [Link(endpoint, keys, inbox) for endpoint in endpoints]
-    subscription: Subscription[Any] = Subscription(inbox, links, notices, on_notice)
-    return subscription if on_sample is None else Listener(subscription, on_sample)
+    if on_sample is not None:
+        return Listener(inbox, links)
+    return Subscription(inbox, links, notices, on_notice)
+
+
+def _tell(notice: Notice, on_notice: Callable[[Notice], object] | None) -> None:
+    if on_notice is not None:
+        on_notice(notice)
+    elif isinstance(notice, (Missed, Unreadable)):
+        log.warning("%s", notice)
+
+
+def _silent(links: Sequence[Link]) -> tuple[str, ...]:
+    return tuple(link.endpoint for link in links if not link.connected)
+
+
+def _stop(links: Sequence[Link]) -> None:
+    for link in links:
+        link.stop()
+    for link in links:
+        link.join()
 
 
 def _abandon(links: Sequence[Link]) -> None:

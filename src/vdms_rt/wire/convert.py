@@ -72,9 +72,23 @@ def displacement_bytes(d: Displacement) -> bytes:
 def displacement_from(data: bytes) -> Displacement:
     """Return the sample in a serialised `vdms.Displacement`.
 
-    Raises google.protobuf.message.DecodeError on bytes that are not one.
+    Raises google.protobuf.message.DecodeError, or ValueError, on bytes that are not one.
+    """
+    return displacement_of(displacement_message(data))
+
+
+def displacement_message(data: bytes) -> pb.Displacement:
+    """Return a serialised `vdms.Displacement` as a message that is fit for `displacement_of`.
+
+    Raises google.protobuf.message.DecodeError, or ValueError, on bytes that are not one.
     """
     m = pb.Displacement.FromString(data)
+    _scan(m.scan)
+    return m
+
+
+def displacement_of(m: pb.Displacement) -> Displacement:
+    """Return the sample in a `vdms.Displacement` message."""
     return Displacement(
         session=m.session,
         marker=m.marker,
