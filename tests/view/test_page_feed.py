@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket as sockets
+import struct
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -135,3 +137,24 @@ def test_a_browser_that_asks_for_nonsense_is_let_go(tmp_path: Path) -> None:
 
     with server(tmp_path, free_endpoint()) as running:
         asyncio.run(browse(running))
+
+
+def test_a_browser_that_goes_before_it_is_answered_leaves_no_trace(tmp_path: Path) -> None:
+    async def browse(running: Server) -> None:
+        async with feed(running):
+            pass
+
+    with server(tmp_path, free_endpoint()) as running:
+        host, port = running.url.removeprefix("http://").rstrip("/").split(":")
+        for _ in range(20):
+            with sockets.create_connection((host, int(port))) as line:
+                line.sendall(
+                    f"GET /feed HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\n"
+                    "Connection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+                    "Sec-WebSocket-Version: 13\r\n\r\n".encode()
+                )
+                # Closed with a reset.
+                line.setsockopt(sockets.SOL_SOCKET, sockets.SO_LINGER, struct.pack("ii", 1, 0))
+        asyncio.run(browse(running))
+        running.stop()
+        assert running.log.read_text() == ""

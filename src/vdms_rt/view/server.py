@@ -151,7 +151,7 @@ class _View:
         sys.stdout.write("\n".join(lines) + "\n")
         sys.stdout.flush()
 
-    async def _feed(self, request: web.Request) -> web.WebSocketResponse:
+    async def _feed(self, request: web.Request) -> web.StreamResponse:
         ws = web.WebSocketResponse(
             heartbeat=HEARTBEAT_S, max_msg_size=LONGEST_REQUEST_BYTES, compress=False
         )
@@ -169,7 +169,8 @@ class _View:
             pass  # the browser went meanwhile
         finally:
             self._sockets.discard(ws)
-        return ws
+        # One that was never answered cannot be closed either.
+        return ws if ws.prepared else web.Response()
 
     async def _ask(self, request: web.Request) -> web.Response:
         station, verb = request.match_info["station"], request.match_info["verb"]
