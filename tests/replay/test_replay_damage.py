@@ -3,6 +3,7 @@ every sample outside of the damage is there and unchanged, and what is missing i
 
 from __future__ import annotations
 
+import contextlib
 import random
 
 import pytest
@@ -151,3 +152,30 @@ def test_a_missing_end_is_told(tmp_path):
     assert "unfinished" in info(path)["not_readable"][0]
     with pytest.raises(ReplayError, match="file exists"):
         recover(path, path)
+
+
+def test_recovering_tells_how_far_it_is(tmp_path, monkeypatch):
+    part = write_recording(tmp_path / "lab.mcap", range(120), finish=False)
+    told = []
+
+    @contextlib.contextmanager
+    def bar(text, total):
+        told.append([text, total, 0])
+
+        def advance(amount):
+            told[-1][2] += amount
+
+        yield advance
+
+    monkeypatch.setattr("vdms_replay.recover.progress", bar)
+    recover(part, tmp_path / "copy.mcap")
+    size_bytes = part.stat().st_size
+    recover(part)
+    recover(tmp_path / "lab.mcap")
+    assert [text for text, _, _ in told] == [
+        "recovering lab.mcap.part",
+        "recovering lab.mcap.part",
+        "checking lab.mcap",
+    ]
+    assert all(0.5 * total < done <= total for _, total, done in told)
+    assert told[0][1] == size_bytes

@@ -125,6 +125,7 @@ def test_a_rate_takes_the_place_of_times_with_few_digits(tmp_path: Path) -> None
     [
         ("time_s,x_mm,y_mm\n0,1,2\n1,2,3\n", {}, "has the columns x_mm, y_mm; choose one"),
         ("time_s,x\n0,1\n1,2\n", {}, "column x does not say its unit; give it with --units"),
+        ("time_s,v_mm_per_s\n0,1\n1,2\n", {}, r"column v_mm_per_s is in mm/s, which is no length"),
         ("time_s,x [mm/s]\n0,1\n1,2\n", {}, r"column x \[mm/s\] is in mm/s, which is no length"),
         ("x_mm\n1\n2\n", {}, "has no column of times; give the sampling rate in hertz"),
         ("time_s,x_mm\n0,1\n1,2\n2,3\n", {}, "column x_mm: 3 values are too few"),

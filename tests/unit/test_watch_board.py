@@ -167,7 +167,7 @@ def test_the_screen_tells_what_is_wrong() -> None:
     assert "NOT RECORDING: the disk is full" in screen(made)[2]
     assert "without pixels" not in screen(made)[2]
     left_out = board(Arrived("s1"), sample(0), health(recording="a.mcap", pixels_left_out=3))
-    assert screen(left_out)[2].endswith("recording a.mcap  without pixels of 3 frames")
+    assert screen(left_out)[2].endswith("without pixels of 3 frames  recording a.mcap")
     assert "no sample for 4 s" in screen(made, at=4_000_000_000)[4]
     made.take(Left("s1"))
     assert screen(made)[2] == "s1  gone"

@@ -7,6 +7,7 @@ import fcntl
 import os
 import zlib
 from collections import Counter, defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -71,21 +72,22 @@ def repair_directory(directory: Path) -> list[Repaired]:
     return done
 
 
-def repair(path: Path) -> Repaired:
+def repair(path: Path, advance: Callable[[int], None] = lambda _: None) -> Repaired:
     """Complete the unfinished file `path`, whose name ends in `.part`.
 
     Everything whose checksum holds is copied as it stands into a new file, which takes the place
-    of the old one only when it is on the disk. Raises BlockingIOError if someone is writing the
+    of the old one only when it is on the disk; `advance` is told the bytes read since its last
+    call. Raises BlockingIOError if someone is writing the
     file, LogFileError if it is not an MCAP, OSError as the disk gives it.
     """
     with path.open("r+b") as held:
         fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.fstat(held.fileno()).st_ino != path.stat().st_ino:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
-        return _repair_locked(path)
+        return _repair_locked(path, advance)
 
 
-def _repair_locked(path: Path) -> Repaired:
+def _repair_locked(path: Path, advance: Callable[[int], None]) -> Repaired:
     if path.stat().st_size == 0:
         path.unlink()
         return Repaired(path, 0, 0, f"{path}: removed, nothing had reached the disk")
@@ -93,7 +95,7 @@ def _repair_locked(path: Path) -> Repaired:
     with LogReader(path) as reader, new.open("wb") as out:
         fcntl.flock(out, fcntl.LOCK_EX | fcntl.LOCK_NB)
         try:
-            messages = copy_readable(reader, out)
+            messages = copy_readable(reader, out, advance)
             out.flush()
             os.fsync(out.fileno())
         except OSError:
@@ -111,7 +113,9 @@ def _repair_locked(path: Path) -> Repaired:
     )
 
 
-def copy_readable(reader: LogReader, out: BinaryIO) -> int:
+def copy_readable(
+    reader: LogReader, out: BinaryIO, advance: Callable[[int], None] = lambda _: None
+) -> int:
     """Write all that `reader` gives as a complete MCAP; return the number of messages.
 
     Chunks are copied without unpacking, so that a file of gigabytes takes seconds. A metadata
@@ -120,6 +124,7 @@ def copy_readable(reader: LogReader, out: BinaryIO) -> int:
     copy = Copy(out)
     for block in reader.blocks():
         copy.add(block)
+        advance(len(block.content))
     copy.metadata(
         Metadata(
             "repair",

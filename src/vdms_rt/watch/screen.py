@@ -133,10 +133,11 @@ def _station_line(name: str, station: StationView) -> Text:
         line.append(f"lost {station.lost}", style="bold red" if station.lost else "")
         if health.record_trouble:
             line.append(f"  NOT RECORDING: {health.record_trouble}", style="bold red")
-        elif health.recording:
+            return line
+        if health.pixels_left_out:
+            line.append(f"  without pixels of {health.pixels_left_out} frames", style="yellow")
+        if health.recording:
             line.append(f"  recording {health.recording}")
         else:
             line.append("  not recording", style="dim")
-        if health.pixels_left_out:
-            line.append(f"  without pixels of {health.pixels_left_out} frames", style="yellow")
     return line

@@ -25,6 +25,7 @@ Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
 
 AXES = ("x_mm", "y_mm", "rotation_mrad")
 DERIVATIVES = (("velocity", 1, "per_s"), ("acceleration", 2, "per_s2"))
+NEEDED = ("time_s", "utc_ns", "marker", "valid", *AXES, "sigma_x_mm")
 GAP_PERIODS = 2.5
 MODES_TOLD = 12
 
@@ -123,7 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
         degree=arguments.degree,
     )
     with progress("reading", sum(_size(path) for path in arguments.files)) as advance:
-        recording = read(*arguments.files, advance=advance)
+        recording = read(*arguments.files, columns=NEEDED, advance=advance)
     table = derive(recording, recipe, arguments.marker)
     if arguments.modes:
         print(modes_text(table, arguments.resolution, arguments.least_db))
@@ -142,8 +143,9 @@ def _size(path: Path) -> int:
 def derive(recording: Recording, recipe: Recipe, marker: str | None = None) -> pd.DataFrame:
     """Return one marker's series on even steps, filtered and derived as `recipe` says.
 
-    Columns `time_s`, `utc`, `utc_ns`, `marker`, `valid` (True), `x_mm`, `y_mm`, `rotation_mrad`,
-    and on request `x_velocity_mm_per_s`, `x_acceleration_mm_per_s2` and so on. A gap has no rows.
+    Of the samples it needs the columns `NEEDED`. Out come `time_s`, `utc`, `utc_ns`, `marker`,
+    `valid` (True), `x_mm`, `y_mm`, `rotation_mrad`, and on request `x_velocity_mm_per_s`,
+    `x_acceleration_mm_per_s2` and so on. A gap has no rows.
     `.attrs["derived"]` says in sentences what was done. Raises ReplayError.
     """
     from vdms_replay import signals

@@ -168,13 +168,22 @@ def load(
 
 
 def read(
-    *files: PathLike, circles: bool = False, advance: Callable[[int], None] | None = None
+    *files: PathLike,
+    circles: bool = False,
+    columns: Sequence[str] | None = None,
+    advance: Callable[[int], None] | None = None,
 ) -> Recording:
     """Return all of a recording but its pixels.
 
-    `files` and `circles` are as for `load`; `advance` is told the bytes read since its last call.
+    `files` and `circles` are as for `load`; of the samples only `columns` are kept, which takes
+    that much less memory, and all for None; `advance` is told the bytes read since its last call.
     Raises ReplayError with a sentence.
     """
+
+    def taken() -> pd.DataFrame:
+        table = samples.take()
+        return table if columns is None else table[list(columns)]
+
     source = Source(files)
     about, clock = About(), Clock()
     samples, truths = Samples(clock, circles=circles), Truths(clock)
@@ -191,7 +200,7 @@ def read(
                 if once.is_new(sample):
                     samples.add(sample)
                     if len(samples) >= ROWS_AT_ONCE:
-                        sample_parts.append(samples.take())
+                        sample_parts.append(taken())
             case pb.Truth() as truth:
                 truths.add(truth, session)
                 if len(truths) >= ROWS_AT_ONCE:
@@ -200,7 +209,7 @@ def read(
                 health.append(one)
             case pb.Run() as run:
                 session = run.session
-    sample_parts.append(samples.take())
+    sample_parts.append(taken())
     truth_parts.append(truths.take())
     return Recording(
         paths=tuple(source.paths),

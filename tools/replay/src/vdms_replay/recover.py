@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 
 from vdms_replay.source import ReplayError, open_log
-from vdms_replay.verb import Verbs, make_parser
+from vdms_replay.verb import Verbs, make_parser, progress
 from vdms_rt.logfile.reader import LogFileError
 from vdms_rt.logfile.repair import copy_readable, repair
 from vdms_rt.logfile.writer import PART_SUFFIX
@@ -42,11 +42,12 @@ def recover(path: Path, out: Path | None = None) -> str:
     """Complete one recording and return a sentence about what became of it.
 
     Without `out` a `.part` is completed in its place, a damaged `.mcap` into `NAME-recovered.mcap`,
-    and a whole one is left alone. Raises ReplayError.
+    and a whole one is left alone. A terminal gets a bar. Raises ReplayError.
     """
     try:
         if out is None and path.name.endswith(PART_SUFFIX):
-            return repair(path).sentence
+            with progress(f"recovering {path.name}", _size_bytes(path)) as advance:
+                return repair(path, advance).sentence
         return _copy(path, out)
     except BlockingIOError:
         raise ReplayError(
@@ -59,17 +60,23 @@ def recover(path: Path, out: Path | None = None) -> str:
         raise ReplayError(f"{where}: {(error.strerror or str(error)).lower()}") from None
 
 
+def _size_bytes(path: Path) -> int:
+    return path.stat().st_size if path.is_file() else 0
+
+
 def _copy(path: Path, out: Path | None) -> str:
     target = out or path.with_name(f"{path.name.partition('.mcap')[0]}-recovered.mcap")
     with open_log(path) as reader:
         if out is None and reader.complete:
-            for _ in reader.blocks():
-                pass
+            with progress(f"checking {path.name}", _size_bytes(path)) as advance:
+                for block in reader.blocks():
+                    advance(len(block.content))
             if not reader.dropped_bytes:
                 return f"{path}: whole, nothing to recover"
     with open_log(path) as reader, target.open("xb") as file:
         try:
-            messages = copy_readable(reader, file)
+            with progress(f"recovering {path.name}", _size_bytes(path)) as advance:
+                messages = copy_readable(reader, file, advance)
             file.flush()
             os.fsync(file.fileno())
         except OSError:

@@ -47,6 +47,8 @@ _ALIASES = {
 _TIME_NAMES = ("time", "t", "x_time", "abscissa")
 _HEAD_LINES = 60
 """Instruments write pages of text before their numbers."""
+_RATE = re.compile(r"_([a-z]+_per_s2?)$")
+"""A velocity or an acceleration, as names say it."""
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d+,\d+(?:[eE][+-]?\d+)?$")
 
 
@@ -157,6 +159,8 @@ def _unit_of(column: Column) -> str:
     bracket = re.search(r"[\[(]([^\])]*)[\])]", column.name)
     if bracket:
         return _known_unit(bracket[1]) or bracket[1].strip()
+    if rate := _RATE.search(column.name):
+        return rate[1].replace("_per_", "/")
     return _known_unit(column.name.rpartition("_")[2])
 
 
@@ -178,7 +182,8 @@ def _mm_per_unit(path: Path, column: Column, asked: str | None) -> tuple[str, fl
         )
     raise ReplayError(
         f"{path}: column {column.name} is in {unit}, which is no length; a displacement in one of "
-        f"{known} is needed (--units says so where the file is wrong)"
+        f"{known} is needed: integrate what is a velocity in the instrument's own software "
+        "(--units says so where the file is wrong)"
     )
 
 
