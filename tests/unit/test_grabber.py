@@ -1,6 +1,7 @@
 """Which device a person means."""
 
 import re
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -229,6 +230,26 @@ def test_usb_facts_come_from_sysfs_also_when_the_node_cannot_be_opened(sysfs):
     assert first.trouble.startswith("/dev/video87654 is not there; plug")
     assert not first.usable
     assert (second.usb_id, second.serial, second.usb_port) == ("", "", "")
+
+
+def test_a_grabber_may_be_pulled_while_the_devices_are_listed(sysfs):
+    link = sysfs / "class" / "video4linux" / "video87654" / "device"
+    device = link.resolve()
+    done = threading.Event()
+
+    def pull_and_plug():
+        while not done.is_set():
+            link.unlink()
+            link.symlink_to(device)
+
+    thread = threading.Thread(target=pull_and_plug)
+    thread.start()
+    try:
+        seen = {d.serial for _ in range(3000) for d in list_devices(sysfs)}
+    finally:
+        done.set()
+        thread.join()
+    assert seen == {"", "EASY01"}
 
 
 def test_speed_that_the_kernel_does_not_know(sysfs):

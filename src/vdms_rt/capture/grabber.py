@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import re
 from collections.abc import Sequence
@@ -109,11 +110,8 @@ class DeviceInfo:
 
 def list_devices(sysfs: Path = SYSFS) -> list[DeviceInfo]:
     """Return every video node of this computer in the order of their numbers."""
-    try:
-        found = list((sysfs / "class" / "video4linux").iterdir())
-    except FileNotFoundError:
-        return []
-    entries = sorted((len(entry.name), entry) for entry in found if entry.name.startswith("video"))
+    found = _matching(sysfs / "class" / "video4linux", "video*")
+    entries = sorted((len(entry.name), entry) for entry in found)
     return [_describe(f"/dev/{entry.name}", _usb_facts(entry / "device")) for _, entry in entries]
 
 
@@ -165,7 +163,7 @@ def better_device(text: str, now: DeviceInfo, sysfs: Path = SYSFS) -> bool:
     plugged in since. Opens no device."""
     if text != "auto" or now.grabber:
         return False
-    found = (sysfs / "class" / "video4linux").glob("video*")
+    found = _matching(sysfs / "class" / "video4linux", "video*")
     return any(_usb_facts(entry / "device").get("id") in GRABBERS for entry in found)
 
 
@@ -247,10 +245,10 @@ def _first_usable(devices: Sequence[DeviceInfo], sysfs: Path) -> DeviceInfo:
 
 def _unbound(sysfs: Path) -> str:
     """Return a sentence on a known grabber that no driver has taken; empty if there is none."""
-    for directory in sorted((sysfs / "bus" / "usb" / "devices").glob("*-*")):
+    for directory in sorted(_matching(sysfs / "bus" / "usb" / "devices", "*-*")):
         usb_id = f"{_read(directory / 'idVendor')}:{_read(directory / 'idProduct')}"
         driver = GRABBERS.get(usb_id)
-        if driver and not list(directory.glob("*/video4linux/video*")):
+        if driver and not _matching(directory, "*/video4linux/video*"):
             return (
                 f"the frame grabber {usb_id} at USB port {directory.name} has no driver; load it "
                 f"with `sudo modprobe {driver}`, and see with `dmesg` what the kernel says"
@@ -311,7 +309,10 @@ def _describe(node: str, usb: dict[str, str]) -> DeviceInfo:
 
 def _usb_facts(device: Path) -> dict[str, str]:
     """Return what sysfs says of the USB device that a device lies in, {} if it lies in none."""
-    resolved = device.resolve()
+    try:
+        resolved = device.resolve()
+    except OSError:  # it was pulled at this moment
+        return {}
     for directory in (resolved, *resolved.parents):
         if (directory / "idVendor").exists():
             break
@@ -325,6 +326,12 @@ def _usb_facts(device: Path) -> dict[str, str]:
         "removable": _read(directory / "removable"),
     }
     return {name: value for name, value in facts.items() if value}
+
+
+def _matching(directory: Path, pattern: str) -> list[Path]:
+    """Return the paths that match, [] without the directory; some may be pulled at this moment,
+    which Path.glob reports as an error."""
+    return [directory / name for name in glob.glob(pattern, root_dir=directory)]  # noqa: PTH207
 
 
 def _number(text: str) -> float | None:
