@@ -42,6 +42,14 @@ class StationView:
     order: tuple[str, ...] = ()
     """Of the markers: as configured, those that move first. Empty before the first set-up."""
 
+    def marker(self, name: str) -> MarkerView:
+        """Return the marker of this name, a new one where it is not known yet."""
+        # Not by setdefault: it would make a whole history for each sample and throw it away.
+        known = self.markers.get(name)
+        if known is None:
+            known = self.markers[name] = MarkerView()
+        return known
+
 
 class Board:
     """Everything that came. The loop's thread alone uses it."""
@@ -87,7 +95,7 @@ class Board:
         station = self._station(sample.station)
         match sample.value:
             case Displacement() as displacement:
-                marker = station.markers.setdefault(sample.marker, MarkerView())
+                marker = station.marker(sample.marker)
                 marker.newest = displacement
                 marker.received_s = sample.received_ns / 1e9
                 marker.history.append(displacement, now_s)
@@ -111,7 +119,7 @@ class Board:
             severity = int(isinstance(notice, Left))
         elif isinstance(notice, Missed):
             name = notice.station
-            marker = self._station(name).markers.setdefault(notice.marker, MarkerView())
+            marker = self._station(name).marker(notice.marker)
             marker.missed += notice.count
             marker.on_the_way += notice.on_the_way
             if not notice.on_the_way:
