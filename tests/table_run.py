@@ -77,5 +77,7 @@ class Measured:
 
 def table(text: str = "", extra: str = "") -> Config:
     return parse_config(
-        f'source = "table"\n[table]\npace = "fast"\nrest_s = 1.2\n{text}\n{extra}', "test"
+        'source = "table"\nsetup.reference_pictures = 30\n[table]\npace = "fast"\nrest_s = 1.2\n'
+        f"{text}\n{extra}",
+        "test",
     )

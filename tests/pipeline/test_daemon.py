@@ -42,6 +42,7 @@ rest_s = 4.0
 {table}
 [setup]
 directory = "{directory}"
+reference_pictures = 30
 [publish]
 listen = ["tcp/127.0.0.1:{port or free_port()}"]
 [record]

@@ -23,7 +23,7 @@ from tools.bench.stage import PERIOD_NS, Stage
 
 def test_sigma_is_true_in_motion_and_from_the_start() -> None:
     runs = [
-        run(Case(5.0, noise, angle, jitter, seed))
+        run(Case(6.5, noise, angle, jitter, seed))
         for seed, (noise, angle, jitter) in enumerate(
             [(1, 0, 1), (2, 30, 5), (4, 60, 1), (2, 60, 5)], 1
         )
@@ -63,7 +63,7 @@ def test_the_first_picture_of_a_sudden_start_has_the_times_share() -> None:
 
 def test_times_and_what_they_cost() -> None:
     """Five seconds in; a minute is the bench."""
-    record = run(Case(8.0, jitter_ms=5.0, seed=3))
+    record = run(Case(9.5, jitter_ms=5.0, seed=3))
     late = record.age_s > 5
     assert record.time_error_ns[late].std() < 100e3
     assert record.refit_error_ns.std() < 50e3
@@ -74,16 +74,16 @@ def test_times_and_what_they_cost() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_line_of_a_still_marker_is_its_references_own_noise(seed: int) -> None:
-    record = run(Case(7.0, seed=seed, motion="still"))
+    record = run(Case(8.5, seed=seed, motion="still"))
     assert len(record.seq) > 300
-    # Of 30 stills each, the fields' references leave no more than their own noise of it.
-    most = 1 + len(record.seq) / 60
+    # Of 60 stills each, the fields' references leave no more than their own noise of it.
+    most = 1 + len(record.seq) / 120
     assert (line_over_floor(record) < 9 * most).all()
     assert len(still_table([record]).rows) == 2
 
 
 def test_a_line_is_seen_where_there_is_one() -> None:
-    record = run(Case(4.0, motion="still"))
+    record = run(Case(5.5, motion="still"))
     turns = np.where(record.seq % 2, -1.0, 1.0)
     record.error_mm[:, 0] += 0.001 * turns
     assert line_over_floor(record)[0] > 50

@@ -323,7 +323,7 @@ def test_a_stroke_of_the_virtual_table_through_the_whole_program(tmp_path):
 source = "table"
 [table]
 pace = "fast"
-frames = 240
+frames = 300
 angle_deg = 20.0
 [table.motion]
 kind = "record"

@@ -42,7 +42,7 @@ from vdms_rt.process.step import begin, found, step
 
 Floats: TypeAlias = NDArray[np.float64]
 
-REST_S = 1.5
+REST_S = 3.0
 AGES_S = (0.0, 2.0, 4.0, 8.0, 1e9)
 MINUTE_S = 60.0
 AXES = ("x", "y")
@@ -342,9 +342,9 @@ def main() -> None:
     parser.add_argument("--angle-deg", default=(0.0, 30.0, 60.0), **several)
     parser.add_argument("--jitter-ms", default=(1.0, 5.0), **several)
     parser.add_argument("--seeds", type=int, default=4, help="records of each kind")
-    parser.add_argument("--seconds", type=float, default=12.0, help="length of these records")
+    parser.add_argument("--seconds", type=float, default=13.5, help="length of these records")
     parser.add_argument("--minute-seconds", type=float, default=90.0, help="of those of the time")
-    parser.add_argument("--still-seconds", type=float, default=70.0, help="of those at rest")
+    parser.add_argument("--still-seconds", type=float, default=71.5, help="of those at rest")
     parser.add_argument("--exposure-ms", type=float, default=0.0)
     parser.add_argument("--only", choices=("sigma", "time", "still"), help="one of the tables")
     parser.add_argument("--processes", type=int, default=multiprocessing.cpu_count())

@@ -72,7 +72,7 @@ class SetUpSection(Section):
     """Empty: $STATE_DIRECTORY of the service, else ~/.local/state/vdms-rt."""
     load: bool = True
     store: bool = True
-    reference_pictures: int = Field(default=30, ge=1, le=1000)
+    reference_pictures: int = Field(default=60, ge=1, le=1000)
     still_px: float = Field(default=0.3, gt=0, le=10)
     """The most that any circle may move, peak to peak, while the reference is taken."""
     stale_px: float = Field(default=0.5, gt=0, le=50)

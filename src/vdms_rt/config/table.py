@@ -80,7 +80,7 @@ class Table(Section):
     """Part of the frames that never arrive."""
     sequence_counts_lost: bool = False
     clutter: bool = True
-    rest_s: float = Field(default=2.0, ge=0, le=600)
+    rest_s: float = Field(default=4.0, ge=0, le=600)
     motion: Motion = Motion()
     shake_mm: float = Field(default=0.0, ge=0, le=50)
     """Amplitude in x of the camera's own movement, as seen in the marker plane; in y it is half
