@@ -241,7 +241,7 @@ def test_what_cannot_be_exported_is_refused_and_leaves_no_file(recording, capsys
         assert "not a directory" in refused(capsys, recording, "--to", to, "--out", recording / "a")
     monkeypatch.setattr(tables, "EXCEL_ROWS", 100)
     assert "use --to parquet" in refused(capsys, recording, "--to", "xlsx")
-    monkeypatch.setattr("vdms_replay.formats.channels.MATLAB_BYTES", 1000)
+    monkeypatch.setattr("vdms_replay.formats.matlab.MATLAB_BYTES", 1000)
     assert "use --to hdf5" in refused(capsys, recording, "--to", "mat")
     assert [path.name for path in folder.iterdir()] == ["a.mcap"]
     (folder / "a.csv").write_text("mine")
@@ -256,3 +256,40 @@ def test_a_recording_of_nothing_valid_has_no_function(tmp_path, capsys):
         tmp_path / "a.mcap", range(20), status=dict.fromkeys(range(20), pb.NOT_FOUND)
     )
     assert "no two valid samples" in refused(capsys, path, "--to", "uff58")
+
+
+def test_mat_is_what_scipy_writes_of_the_same_columns(recording, monkeypatch):
+    """Also where the columns wait on the disk in many blocks."""
+    monkeypatch.setattr("vdms_replay.formats.spill.BLOCK_ROWS", 7)
+    out, _ = exported(recording, "mat")
+    found = scipy.io.loadmat(out)
+    for marker, name in (("m1", "m1"), ("m-2", "m_2")):
+        table = expected(recording, marker).drop(columns=["utc", "marker"])
+        columns = {
+            column: np.array(list(table[column]), str)
+            if column in TEXTS
+            else table[column].to_numpy().reshape(-1, 1)
+            for column in table
+        }
+        other = recording.with_suffix(".other.mat")
+        scipy.io.savemat(other, {"m": columns}, long_field_names=True)
+        same = scipy.io.loadmat(other)["m"][0, 0]
+        assert found[name].dtype.names == same.dtype.names
+        for column in table:
+            one, two = found[name][0, 0][column], same[column]
+            assert one.dtype == two.dtype, column
+            np.testing.assert_array_equal(one, two, err_msg=column)
+    assert found["m1"][0, 0]["valid"].dtype == np.uint8
+    assert {n: c for n, _, c in scipy.io.whosmat(out)}["m1"] == "struct"
+
+
+def test_nothing_stays_of_an_export_that_was_stopped(recording, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    for to in FORMATS:
+        with monkeypatch.context() as patched:
+            patched.setattr("vdms_replay.export.to_si", stop)
+            with pytest.raises(KeyboardInterrupt):
+                export(recording, to=to, si=True)
+        assert [path.name for path in recording.parent.iterdir()] == ["a.mcap"]

@@ -155,7 +155,7 @@ def writing(path: Path, to: str, meta: dict[str, Any], *, force: bool) -> Iterat
             yield writer
         except BaseException:
             with contextlib.suppress(FormatError, OSError):
-                writer.close()
+                writer.discard()
             raise
         writer.close()
         begun.replace(path)

@@ -29,6 +29,10 @@ class Writer(Protocol):
         """Complete the file. Raises FormatError."""
         ...
 
+    def discard(self) -> None:
+        """Let go of the file, which stays unfinished."""
+        ...
+
 
 MakeWriter = Callable[[Path, Meta], Writer]
 
@@ -62,7 +66,7 @@ def _hdf5(path: Path, meta: Meta) -> Writer:
 
 
 def _mat(path: Path, meta: Meta) -> Writer:
-    from vdms_replay.formats.channels import MatWriter
+    from vdms_replay.formats.matlab import MatWriter
 
     return MatWriter(path, meta)
 

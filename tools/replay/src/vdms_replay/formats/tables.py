@@ -39,6 +39,8 @@ class CsvWriter:
     def close(self) -> None:
         self._file.close()
 
+    discard = close
+
 
 class ParquetWriter:
     """Apache Parquet: unit and meaning at each field, all else as JSON under the key `vdms`."""
@@ -70,6 +72,8 @@ class ParquetWriter:
     def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
+
+    discard = close
 
 
 class XlsxWriter:
@@ -116,6 +120,9 @@ class XlsxWriter:
 
     def close(self) -> None:
         self._book.save(self._path)
+
+    # Its streams end in order only so; then its temporary files go.
+    discard = close
 
 
 def utc_texts(table: pd.DataFrame) -> Any:

@@ -55,6 +55,8 @@ class TdmsWriter:
     def close(self) -> None:
         self._writer.close()
 
+    discard = close
+
 
 def _values(column: pd.Series[Any]) -> Any:
     if column.dtype.kind == "b":

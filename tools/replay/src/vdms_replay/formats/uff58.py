@@ -61,6 +61,9 @@ class Uff58Writer:
         if self._left_out:
             self.notes.append(f"{self._left_out} samples without a valid position were left out")
 
+    def discard(self) -> None:
+        self._parts.clear()
+
     def _write(self, file: Any, node: int, marker: str, table: pd.DataFrame) -> None:
         time_s = table["time_s"].to_numpy()
         grid = _grid(time_s)
