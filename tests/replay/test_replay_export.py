@@ -293,3 +293,11 @@ def test_nothing_stays_of_an_export_that_was_stopped(recording, monkeypatch):
             with pytest.raises(KeyboardInterrupt):
                 export(recording, to=to, si=True)
         assert [path.name for path in recording.parent.iterdir()] == ["a.mcap"]
+
+
+def test_uff58_is_the_same_for_any_size_of_blocks(recording, monkeypatch):
+    whole = exported(recording, "uff58")[0].read_bytes()
+    for rows in (1, 3, 7):
+        monkeypatch.setattr("vdms_replay.formats.spill.BLOCK_ROWS", rows)
+        assert exported(recording, "uff58", force=True)[0].read_bytes() == whole
+    assert [path.name for path in recording.parent.iterdir() if "part" in path.name] == []

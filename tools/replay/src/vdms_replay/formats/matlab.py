@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import struct
 import zlib
@@ -71,6 +72,10 @@ class MatWriter:
         return np.array(numbers, np.int32)[codes]
 
     def close(self) -> None:
+        with contextlib.closing(self._spill):
+            self._write_all()
+
+    def _write_all(self) -> None:
         names: dict[str, Any] = {"about": None}
         scipy.io.savemat(
             self._path,
@@ -88,7 +93,6 @@ class MatWriter:
                     self.notes.append(f"marker {marker} is the variable {name}")
                 found = {column: _Column(self, marker, column) for column in columns}
                 _write_compressed(file, _struct(name, found))
-        self._spill.close()
 
     def discard(self) -> None:
         self._spill.close()
