@@ -17,7 +17,17 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Footer, Header, Message, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    Footer,
+    Header,
+    Message,
+    Metadata,
+    Schema,
+    Statistics,
+)
 from mcap.stream_reader import get_chunk_data_stream
 
 from vdms_rt.model import VdmsError
@@ -112,6 +122,10 @@ class LogReader:
         """What was not readable so far."""
         self.faults: list[str] = []
         """One phrase for each place that was not readable."""
+        self.counts: dict[str, int] = {}
+        """Messages by topic, as the end of a complete file says it; else empty."""
+        self.length_ns = 0
+        """From the first log time to the last, likewise."""
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._read_summary()
@@ -251,7 +265,8 @@ class LogReader:
             self._channels[channel.id] = channel
 
     def _read_summary(self) -> None:
-        """Take schemas and channels from the end of a complete file: they help past damage."""
+        """Take schemas and channels from the end of a complete file, which help past damage, and
+        its counts."""
         end = self.size_bytes - len(MAGIC) - FOOTER_BYTES
         if end < len(MAGIC):
             return
@@ -273,10 +288,20 @@ class LogReader:
             while offset < len(summary):
                 opcode, length = HEAD.unpack_from(summary, offset)
                 start = offset + HEAD.size
+                inner = summary[start : start + length]
                 if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    inner = summary[start : start + length]
                     self._parse_inner(Block(opcode, inner), opcode, inner, 0)
+                elif opcode == Opcode.STATISTICS:
+                    self._take_counts(Statistics.read(ReadDataStream(BytesIO(inner))))
                 offset = start + length
+
+    def _take_counts(self, statistics: Statistics) -> None:
+        """Take the counts; the channels stand before them."""
+        self.length_ns = statistics.message_end_time - statistics.message_start_time
+        for channel_id, count in statistics.channel_message_counts.items():
+            channel = self._channels.get(channel_id)
+            if channel is not None:
+                self.counts[channel.topic] = self.counts.get(channel.topic, 0) + count
 
 
 def _is_consistent(opcode: int, content: bytes) -> bool:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from vdms_replay.align import Camera
 from vdms_replay.load import Recording
@@ -25,8 +26,8 @@ class Chosen:
     marker: str
     table: pd.DataFrame
     """All samples after the set-up, those without a position too, in the order of time."""
-    valid: pd.DataFrame
-    """Those that are measurements against the reference with most of them."""
+    on: NDArray[np.bool_]
+    """Rows of `table` that are measurements against the reference with most of them."""
     set_up: SetUp | None
     """The last one in force for them."""
     own: MarkerSetUp | None
@@ -34,75 +35,113 @@ class Chosen:
     """Valid samples against another reference: their zero is another."""
 
     @property
+    def count(self) -> int:
+        """Rows that are `on`."""
+        return int(self.on.sum())
+
+    def valid(self, name: str) -> NDArray[Any]:
+        """Return a column of the rows that are `on`, (count,)."""
+        values: NDArray[Any] = self.table[name].to_numpy()[self.on]
+        return values
+
+    @property
+    def first(self) -> pd.Series[Any]:
+        return self.table.iloc[int(self.on.argmax())]
+
+    @property
+    def last(self) -> pd.Series[Any]:
+        return self.table.iloc[len(self.on) - 1 - int(self.on[::-1].argmax())]
+
+    @property
     def exposed(self) -> str:
         """`field`, `frame` (whole, of two fields) or `progressive`."""
-        scans = set(self.valid["scan"].astype(str))
+        scans = _scans(self.table, self.on)
         if scans <= set(FIELD_SCANS):
             return "field"
         return "progressive" if scans == {"progressive"} else "frame"
 
 
+NEEDED = (
+    "time_s", "utc_ns", "marker", "x_mm", "y_mm", "valid", "status", "frame_seq", "scan",
+    "setup_revision", "session",
+)  # fmt: skip
+"""Columns without which nothing can be chosen, nor put beside a reference."""
+
+
 def choose(
     recording: Recording,
     marker: str | None = None,
-    from_s: float = 0.0,
+    from_s: float = -math.inf,
     to_s: float = math.inf,
 ) -> Chosen:
     """Return one marker's samples between two times, in seconds from the recording's first sample.
 
     Raises ReplayError where there are none, or whole frames and fields are mixed.
     """
-    table = recording.of_marker(marker)
-    name = str(table["marker"].iloc[0])
-    inside = table[(table["time_s"] >= from_s) & (table["time_s"] <= to_s)]
-    if inside.empty:
-        raise ReplayError(
-            f"{_named(recording)}: no sample of marker {name} lies {_between(from_s, to_s)}; "
-            f"it has samples from {table['time_s'].iloc[0]:.1f} to "
-            f"{table['time_s'].iloc[-1]:.1f} s"
-        )
-    measured = inside[inside["valid"]]
-    if measured.empty:
+    inside = recording.of_marker(marker, from_s, to_s)
+    name = str(inside["marker"].iloc[0])
+    measured = inside["valid"].to_numpy(bool)
+    if not measured.any():
         raise ReplayError(
             f"{_named(recording)}: marker {name} has no valid sample; the recording ends before "
             "its reference was taken, or the marker was not seen"
         )
-    pairs = list(zip(measured["session"], measured["setup_revision"], strict=True))
-    zeros = {pair: _reference_of(recording, name, *pair) for pair in set(pairs)}
-    keys = [zeros[pair] for pair in pairs]
-    ((most, _),) = Counter(keys).most_common(1)
-    valid = measured[[key == most for key in keys]]
-    times_s = valid["time_s"].to_numpy()
-    valid = valid[np.concatenate([[True], np.diff(np.maximum.accumulate(times_s)) > 0])]
-    scans = set(valid["scan"].astype(str))
+    on = measured & _against_one(recording, name, inside, measured)
+    rows = np.flatnonzero(on)
+    times_s = inside["time_s"].to_numpy()[rows]
+    on[rows[1:][np.diff(np.maximum.accumulate(times_s)) <= 0]] = False
+    scans = _scans(inside, on)
     if scans & set(FIELD_SCANS) and scans - set(FIELD_SCANS):
         raise ReplayError(
             f"{_named(recording)}: marker {name} was measured in whole frames and in fields; cut "
             "out one part with --from-s and --to-s"
         )
-    set_up, own = _set_up(recording, name, valid)
     begin = int(np.argmax((inside["status"].to_numpy() & 1) == 0))
-    return Chosen(
-        marker=name,
-        table=inside.iloc[begin:].reset_index(drop=True),
-        valid=valid.reset_index(drop=True),
-        set_up=set_up,
-        own=own,
-        left_out=len(measured) - len(valid),
+    left_out = int(measured.sum()) - int(on.sum())
+    chosen = Chosen(
+        name, inside.iloc[begin:].reset_index(drop=True), on[begin:], None, None, left_out
     )
+    set_up, own = _set_up(recording, chosen)
+    return replace(chosen, set_up=set_up, own=own)
+
+
+def _against_one(
+    recording: Recording, marker: str, table: pd.DataFrame, measured: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return the rows against the reference with most measurements."""
+    numbers = table.groupby(["session", "setup_revision"], sort=False).ngroup().to_numpy()
+    counts: Counter[object] = Counter()
+    zeros = {}
+    groups, places, many = np.unique(numbers[measured], return_index=True, return_counts=True)
+    rows = np.flatnonzero(measured)[places]
+    for group, row, count in sorted(
+        zip(groups.tolist(), rows.tolist(), many.tolist(), strict=True), key=lambda one: one[1]
+    ):
+        session, revision = table["session"].iloc[row], int(table["setup_revision"].iloc[row])
+        zeros[group] = _reference_of(recording, marker, session, revision)
+        counts[zeros[group]] += count
+    ((most, _),) = counts.most_common(1)
+    found: NDArray[np.bool_] = np.isin(
+        numbers, [group for group, zero in zeros.items() if zero == most]
+    )
+    return found
+
+
+def _scans(table: pd.DataFrame, rows: NDArray[np.bool_]) -> set[str]:
+    scan = table["scan"].cat
+    return {str(scan.categories[code]) for code in np.unique(scan.codes.to_numpy()[rows])}
 
 
 def camera_of(recording: Recording, chosen: Chosen, exposure_s: float | None = None) -> Camera:
     """Return the chosen samples as a camera took them; `exposure_s` in place of the recorded."""
-    valid = chosen.valid
     fields_s: tuple[float, ...] = (0.0,)
     if chosen.exposed == "frame":
-        quarter_s = frame_period_s(valid) / 4
+        quarter_s = _frame_period_s(chosen) / 4
         fields_s = (-quarter_s, quarter_s)
     return Camera(
-        time_s=valid["time_s"].to_numpy(np.float64),
-        x_mm=valid["x_mm"].to_numpy(np.float64),
-        y_mm=valid["y_mm"].to_numpy(np.float64),
+        time_s=chosen.valid("time_s"),
+        x_mm=chosen.valid("x_mm"),
+        y_mm=chosen.valid("y_mm"),
         exposure_s=exposure_of(recording.about.config) if exposure_s is None else exposure_s,
         fields_s=fields_s,
     )
@@ -114,11 +153,12 @@ def exposure_of(config: dict[str, Any]) -> float:
     return float(config.get(section, {}).get("exposure_ms", 0.0)) / 1000
 
 
-def frame_period_s(table: pd.DataFrame) -> float:
+def _frame_period_s(chosen: Chosen) -> float:
     """Return the time from one frame to the next; NaN of a single frame."""
-    alike = table[table["scan"] == table["scan"].iloc[0]]
-    frames = np.diff(alike["frame_seq"].to_numpy())
-    steps_s = np.diff(alike["time_s"].to_numpy())[frames > 0]
+    codes = chosen.table["scan"].cat.codes.to_numpy()
+    alike = chosen.on & (codes == codes[int(chosen.on.argmax())])
+    frames = np.diff(chosen.table["frame_seq"].to_numpy()[alike])
+    steps_s = np.diff(chosen.table["time_s"].to_numpy()[alike])[frames > 0]
     return float(np.median(steps_s / frames[frames > 0])) if len(steps_s) else math.nan
 
 
@@ -131,19 +171,13 @@ def _reference_of(recording: Recording, marker: str, session: str, revision: int
     return session, next((m.homography for m in set_up.markers if m.shape.name == marker), revision)
 
 
-def _set_up(
-    recording: Recording, marker: str, valid: pd.DataFrame
-) -> tuple[SetUp | None, MarkerSetUp | None]:
-    last = valid.iloc[-1]
+def _set_up(recording: Recording, chosen: Chosen) -> tuple[SetUp | None, MarkerSetUp | None]:
+    last = chosen.last
     try:
         set_up = recording.about.set_ups[last["session"], int(last["setup_revision"])].set_up()
     except (KeyError, SetUpError):
         return None, None
-    return set_up, next((m for m in set_up.markers if m.shape.name == marker), None)
-
-
-def _between(from_s: float, to_s: float) -> str:
-    return f"after {from_s:g} s" if math.isinf(to_s) else f"between {from_s:g} and {to_s:g} s"
+    return set_up, next((m for m in set_up.markers if m.shape.name == chosen.marker), None)
 
 
 def _named(recording: Recording) -> str:

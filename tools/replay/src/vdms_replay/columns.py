@@ -214,6 +214,57 @@ class Truths:
         return pd.DataFrame(columns)
 
 
+WORDS = ("marker", "session", "status_text")
+"""Columns of texts, of which few differ."""
+
+
+class Held:
+    """Batches of rows until all are there. Each column is then made whole by itself, so that only
+    one at a time is there twice."""
+
+    def __init__(self, columns: Sequence[str] | None = None, *, compact: bool = False) -> None:
+        """Keep `columns`, all for None; with `compact` the columns of texts as categories."""
+        self._columns = columns
+        self._compact = compact
+        self._parts: dict[str, list[Any]] = {}
+        self._words: dict[str, dict[str, int]] = {}
+        self._rows = 0
+
+    def add(self, table: pd.DataFrame, rows: NDArray[np.bool_] | None = None) -> None:
+        """Take the batch that follows, or some rows of it."""
+        for name in table.columns if self._columns is None else self._columns:
+            # A copy, because a view of one column would keep the whole batch.
+            part = table[name].array.copy() if rows is None else table[name].array[rows]
+            if self._compact and name in WORDS:
+                part = self._codes(name, part)
+            if name not in self._parts:
+                # The circles are first seen in a later batch.
+                self._parts[name] = [np.full(self._rows, np.nan)] if self._rows else []
+            self._parts[name].append(part)
+        self._rows += len(table) if rows is None else int(rows.sum())
+
+    def _codes(self, name: str, texts: Any) -> NDArray[np.int32]:
+        known = self._words.setdefault(name, {})
+        places, found = pd.factorize(texts)
+        numbers = [known.setdefault(str(text), len(known)) for text in found]
+        return np.array(numbers, np.int32)[places]
+
+    def whole(self) -> pd.DataFrame:
+        """Return all rows, and keep none."""
+        columns = {}
+        for name in list(self._parts):
+            parts = self._parts.pop(name)
+            if name in self._words:
+                codes = np.concatenate(parts)
+                columns[name] = pd.Categorical.from_codes(codes, pd.Index(list(self._words[name])))
+            else:
+                columns[name] = pd.concat(
+                    [pd.Series(part) for part in parts], ignore_index=True
+                ).array
+        self._rows = 0
+        return pd.DataFrame(columns, copy=False)
+
+
 def utc_column(utc_ns: NDArray[np.int64]) -> Any:
     """Return UTC times; NaT where `utc_ns` is 0."""
     times = utc_ns.astype("datetime64[ns]")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vdms_replay.comparison import Comparison, add_reference_arguments, compare, positive
+from vdms_replay.part import add_part_arguments
 from vdms_replay.source import ReplayError
 from vdms_replay.verb import Verbs, make_parser, number
 
@@ -30,6 +31,7 @@ def add_parser(verbs: Verbs) -> None:
         "a plot of the error over distance and angle.",
     )
     parser.add_argument("file", type=Path, nargs="+", metavar="FILE")
+    add_part_arguments(parser)
     add_reference_arguments(parser, several=True)
     parser.add_argument(
         "--paper",

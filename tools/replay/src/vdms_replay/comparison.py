@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vdms_replay.part import Part, read_part, seconds
 from vdms_replay.source import ReplayError
 from vdms_replay.verb import number, progress
 
@@ -59,9 +60,6 @@ def add_reference_arguments(parser: argparse.ArgumentParser, *, several: bool) -
         help="sampling rate, where the file has no times, or times of few digits",
     )  # fmt: skip
     group = parser.add_argument_group("putting both together")
-    group.add_argument("--marker", metavar="NAME", help="where the recording has several")
-    group.add_argument("--from-s", type=seconds, default=0.0, metavar="S", help="begin there")
-    group.add_argument("--to-s", type=seconds, default=math.inf, metavar="S", help="end there")
     group.add_argument(
         "--offset", type=number(-1e12, 1e12, "a number of seconds"), metavar="S",
         help="what the reference's clock shows at the recording's zero, about",
@@ -97,10 +95,11 @@ def compare(
     angle_deg: float = math.nan,
 ) -> Comparison:
     """Return a recording beside a reference file. Raises ReplayError with a sentence."""
-    from vdms_replay.load import read
+    from vdms_replay.chosen import NEEDED
 
+    part = Part(NEEDED, arguments.marker, arguments.from_s, arguments.to_s)
     with progress(f"reading {path.name}", path.stat().st_size if path.is_file() else 0) as advance:
-        recording = read(path, advance=advance)
+        recording = read_part(path, part=part, advance=advance)
     return compared(recording, reference, arguments, distance_m, angle_deg)
 
 
@@ -162,4 +161,3 @@ def compared(
 
 
 positive = number(1e-9, 1e9, "a number above 0")
-seconds = number(0, 1e12, "seconds, 0 or more")

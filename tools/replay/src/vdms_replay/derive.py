@@ -14,7 +14,8 @@ import pandas as pd
 from vdms_replay.columns import MEANINGS, UNITS, utc_column
 from vdms_replay.export import add_output_options, si_name, si_unit, target_path, to_si, writing
 from vdms_replay.formats import FORMATS
-from vdms_replay.load import Recording, iso, read
+from vdms_replay.load import Recording, chosen_rows, iso
+from vdms_replay.part import Part, add_part_arguments, read_part
 from vdms_replay.source import ReplayError
 from vdms_replay.verb import Verbs, make_parser, number, progress
 
@@ -60,7 +61,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
     parser.add_argument("--to", choices=tuple(FORMATS), help="write the result in this format")
-    parser.add_argument("--marker", metavar="NAME", help="where several markers moved")
+    add_part_arguments(parser)
     positive = number(1e-6, 1e6, "a number above 0")
     parser.add_argument(
         "--resample", type=positive, metavar="HZ", help="(default: the recording's own rate)"
@@ -124,8 +125,9 @@ def run(arguments: argparse.Namespace) -> int:
         degree=arguments.degree,
     )
     with progress("reading", sum(_size(path) for path in arguments.files)) as advance:
-        recording = read(*arguments.files, columns=NEEDED, advance=advance)
-    table = derive(recording, recipe, arguments.marker)
+        part = Part(NEEDED, arguments.marker, arguments.from_s, arguments.to_s)
+        recording = read_part(*arguments.files, part=part, advance=advance)
+    table = derive(recording, recipe, arguments.marker, arguments.from_s, arguments.to_s)
     if arguments.modes:
         print(modes_text(table, arguments.resolution, arguments.least_db))
     if arguments.to is not None:
@@ -140,8 +142,15 @@ def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
-def derive(recording: Recording, recipe: Recipe, marker: str | None = None) -> pd.DataFrame:
-    """Return one marker's series on even steps, filtered and derived as `recipe` says.
+def derive(
+    recording: Recording,
+    recipe: Recipe,
+    marker: str | None = None,
+    from_s: float = -math.inf,
+    to_s: float = math.inf,
+) -> pd.DataFrame:
+    """Return one marker's series between two times on even steps, filtered and derived as `recipe`
+    says.
 
     Of the samples it needs the columns `NEEDED`. Out come `time_s`, `utc`, `utc_ns`, `marker`,
     `valid` (True), `x_mm`, `y_mm`, `rotation_mrad`, and on request `x_velocity_mm_per_s`,
@@ -151,8 +160,9 @@ def derive(recording: Recording, recipe: Recipe, marker: str | None = None) -> p
     from vdms_replay import signals
 
     _check(recipe)
-    whole = recording.of_marker(marker)
-    samples = whole[whole["valid"]]
+    whole = recording.of_marker(marker, from_s, to_s)
+    samples = chosen_rows(whole, whole["valid"].to_numpy(bool))
+    del whole
     if len(samples) < signals.LEAST:
         raise ReplayError(
             f"the marker has {len(samples)} valid samples, and {signals.LEAST} are the least"

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
+import numpy as np
 import pandas as pd
 from mcap.records import Attachment, Metadata
+from numpy.typing import NDArray
 
-from vdms_replay.columns import MEANINGS, UNITS, Clock, Samples, Truths
+from vdms_replay.columns import MEANINGS, UNITS, Clock, Held, Samples, Truths
 from vdms_replay.source import SAMPLE, Damage, Entry, PathLike, ReplayError, Source, station_of
 from vdms_rt.setup import SetUp, set_up_from_json
 from vdms_rt.wire import vdms_pb2 as pb
@@ -118,18 +121,34 @@ class Recording:
     """What of each file could not be read."""
     doubled: int
     """Samples that stood in the files twice, and are given once."""
+    reach_s: Reach
+    """Times of each marker's first and last sample."""
 
     @property
     def markers(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(self.samples["marker"]))
+        return tuple(self.reach_s)
 
-    def of_marker(self, marker: str | None = None) -> pd.DataFrame:
-        """Return the samples of one marker; for None of the only one that is not fixed.
+    def of_marker(
+        self, marker: str | None = None, from_s: float = -math.inf, to_s: float = math.inf
+    ) -> pd.DataFrame:
+        """Return the samples of one marker between two times, in seconds from the first sample of
+        the recording; for None of the only marker that is not fixed.
 
-        Raises ReplayError if there is no such marker, or more than one.
+        Raises ReplayError if there is no such marker, or more than one, or no sample.
         """
         name = choose_marker(self.about, self.markers, marker)
-        return self.samples[self.samples["marker"] == name].reset_index(drop=True)
+        rows = (self.samples["marker"] == name).to_numpy()
+        if from_s > -math.inf or to_s < math.inf:
+            time_s = self.samples["time_s"].to_numpy()
+            rows = rows & (time_s >= from_s) & (time_s <= to_s)
+        if not rows.any():
+            begin_s, end_s = self.reach_s[name]
+            named = ", ".join(str(path) for path in self.paths)
+            raise ReplayError(
+                f"{named}: no sample of marker {name} lies {between(from_s, to_s)}; "
+                f"it has samples from {begin_s:.1f} to {end_s:.1f} s"
+            )
+        return chosen_rows(self.samples, rows)
 
     @property
     def meta(self) -> dict[str, Any]:
@@ -180,17 +199,20 @@ def read(
     Raises ReplayError with a sentence.
     """
 
-    def taken() -> pd.DataFrame:
-        table = samples.take()
-        return table if columns is None else table[list(columns)]
-
     source = Source(files)
     about, clock = About(), Clock()
     samples, truths = Samples(clock, circles=circles), Truths(clock)
-    sample_parts, truth_parts = [], []
+    held, truths_held = Held(columns), Held()
+    reach_s: Reach = {}
     health: list[pb.Health] = []
     once = Once()
     session = 0
+
+    def keep_samples() -> None:
+        table = samples.take()
+        extend(reach_s, table)
+        held.add(table)
+
     for item in source.items(NOT_PIXELS, advance):
         about.take(item)
         if not isinstance(item, Entry):
@@ -200,26 +222,54 @@ def read(
                 if once.is_new(sample):
                     samples.add(sample)
                     if len(samples) >= ROWS_AT_ONCE:
-                        sample_parts.append(taken())
+                        keep_samples()
             case pb.Truth() as truth:
                 truths.add(truth, session)
                 if len(truths) >= ROWS_AT_ONCE:
-                    truth_parts.append(truths.take())
+                    truths_held.add(truths.take())
             case pb.Health() as one:
                 health.append(one)
             case pb.Run() as run:
                 session = run.session
-    sample_parts.append(taken())
-    truth_parts.append(truths.take())
+    keep_samples()
+    truths_held.add(truths.take())
     return Recording(
         paths=tuple(source.paths),
         about=about,
-        samples=pd.concat(sample_parts, ignore_index=True),
-        truth=pd.concat(truth_parts, ignore_index=True),
-        health=_health_table(health),
+        samples=held.whole(),
+        truth=truths_held.whole(),
+        health=health_table(health),
         damage=tuple(source.damage.values()),
         doubled=once.doubled,
+        reach_s=reach_s,
     )
+
+
+Reach: TypeAlias = dict[str, tuple[float, float]]
+"""Times of the first and the last sample of each marker, in the order of their appearance."""
+
+
+def extend(reach_s: Reach, table: pd.DataFrame) -> None:
+    """Let each marker's reach go on to the end of the samples that follow."""
+    for name, time_s in table.groupby("marker", sort=False)["time_s"]:
+        begin_s, _ = reach_s.get(str(name), (math.nan, math.nan))
+        if math.isnan(begin_s):
+            begin_s = float(time_s.iloc[0])
+        reach_s[str(name)] = begin_s, float(time_s.iloc[-1])
+
+
+def chosen_rows(table: pd.DataFrame, rows: NDArray[np.bool_]) -> pd.DataFrame:
+    """Return some rows, numbered from 0; without a copy if that is all of them."""
+    if rows.all():
+        return table.copy(deep=False)
+    return pd.DataFrame({name: table[name].array[rows] for name in table.columns}, copy=False)
+
+
+def between(from_s: float, to_s: float) -> str:
+    """Return a part of the time in words."""
+    if math.isinf(from_s):
+        return "anywhere" if math.isinf(to_s) else f"before {to_s:g} s"
+    return f"after {from_s:g} s" if math.isinf(to_s) else f"between {from_s:g} and {to_s:g} s"
 
 
 NOT_PIXELS = (
@@ -306,7 +356,8 @@ def _event_line(event: pb.Event) -> str:
 HEALTH_FIELDS = [field.name for field in pb.Health.DESCRIPTOR.fields]
 
 
-def _health_table(messages: list[pb.Health]) -> pd.DataFrame:
+def health_table(messages: Sequence[pb.Health]) -> pd.DataFrame:
+    """Return a row for each message."""
     table = pd.DataFrame(
         [[getattr(message, name) for name in HEALTH_FIELDS] for message in messages],
         columns=HEALTH_FIELDS,

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from vdms_replay.comparison import add_reference_arguments, compared
+from vdms_replay.part import Part, add_part_arguments, read_part
 from vdms_replay.source import ReplayError, Source
 from vdms_replay.verb import Verbs, make_parser, progress
 
@@ -28,6 +29,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument("--title", default="", metavar="TEXT", help="the heading of the report")
     parser.add_argument("--note", default="", metavar="TEXT", help="a paragraph below the heading")
+    add_part_arguments(parser)
     add_reference_arguments(parser, several=False)
 
 
@@ -39,12 +41,12 @@ def run(arguments: argparse.Namespace) -> int:
             f"not {out.suffix or 'one without a suffix'}"
         )
     from vdms_replay.chosen import choose
-    from vdms_replay.load import read
-    from vdms_replay.report_content import report_of
+    from vdms_replay.report_content import NEEDED, report_of
 
     source = Source(arguments.files)
     with progress("reading", source.size_bytes) as advance:
-        recording = read(*arguments.files, advance=advance)
+        part = Part(NEEDED, arguments.marker, arguments.from_s, arguments.to_s)
+        recording = read_part(*arguments.files, part=part, advance=advance)
     chosen = choose(recording, arguments.marker, arguments.from_s, arguments.to_s)
     comparison = None
     if arguments.reference is not None:
@@ -63,5 +65,5 @@ def run(arguments: argparse.Namespace) -> int:
         raise ReplayError(
             f"{out}: cannot be written: {(error.strerror or str(error)).lower()}"
         ) from None
-    print(f"{out}: report of marker {chosen.marker}, {len(chosen.valid)} valid samples")
+    print(f"{out}: report of marker {chosen.marker}, {chosen.count} valid samples")
     return 0

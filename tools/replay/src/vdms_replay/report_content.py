@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 import vdms_replay
 from vdms_replay import compare
+from vdms_replay.chosen import NEEDED as CHOOSING
 from vdms_replay.chosen import Chosen, exposure_of
 from vdms_replay.figures import figure_of_comparison
 from vdms_replay.load import Recording, iso
@@ -31,6 +32,10 @@ from vdms_rt.wire import vdms_pb2 as pb
 if TYPE_CHECKING:
     from vdms_replay.comparison import Comparison
 
+NEEDED = (
+    *CHOOSING, "rotation_mrad", "sigma_x_mm", "sigma_y_mm", "residual_mm", "seq", "sigma_t_ns",
+)  # fmt: skip
+"""Columns of the samples."""
 GAPS_TOLD = 15
 EVENTS_TOLD = 25
 QUIET = 5.0
@@ -137,7 +142,7 @@ def report_of(
         *_set_up_text(recording, chosen),
         *_happened(recording),
     ]
-    begin = _time(chosen.valid["utc_ns"].iloc[0])
+    begin = _time(chosen.first["utc_ns"])
     subtitle = f"Station {about.station}, marker {chosen.marker}" + (f", {begin}" if begin else "")
     return Report(title or "Displacement measurement", subtitle, blocks)
 
@@ -151,8 +156,8 @@ UNCERTAINTY = (
 
 
 def _heads(recording: Recording, chosen: Chosen, summary: MarkerSummary) -> list[tuple[str, str]]:
-    about, valid = recording.about, chosen.valid
-    begin, end = _time(valid["utc_ns"].iloc[0]), _time(valid["utc_ns"].iloc[-1])
+    about = recording.about
+    begin, end = _time(chosen.first["utc_ns"]), _time(chosen.last["utc_ns"])
     seconds = summary.last_s - summary.first_s
     exposed = {
         "field": "each field by itself",
@@ -218,9 +223,9 @@ def _about_lines(lines: Lines | None) -> str:
 
 
 def _quality(recording: Recording, chosen: Chosen, summary: MarkerSummary) -> list[tuple[str, str]]:
-    valid, health = chosen.valid, recording.health
-    residual_mm = rms(valid["residual_mm"].to_numpy(np.float64))
-    time_us = rms(valid["sigma_t_ns"].to_numpy(np.float64)) / 1000
+    health = recording.health
+    residual_mm = rms(chosen.valid("residual_mm"))
+    time_us = rms(chosen.valid("sigma_t_ns").astype(np.float64)) / 1000
     part = 100 * summary.valid / summary.samples
     rows = [
         ("Valid", f"{summary.valid} of {summary.samples} samples, {part:.2f} %"),
@@ -358,7 +363,7 @@ def _picture(recording: Recording, chosen: Chosen) -> list[Block]:
 
 
 def _set_up_text(recording: Recording, chosen: Chosen) -> list[Block]:
-    last = chosen.valid.iloc[-1]
+    last = chosen.last
     said = recording.about.set_ups.get((last["session"], int(last["setup_revision"])))
     return [] if said is None else [Heading("Set-up"), Lettering(said.report)]
 

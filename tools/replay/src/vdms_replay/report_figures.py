@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy import signal
@@ -40,6 +41,12 @@ HANN_BANDWIDTH = 1.5
 LEAST_PEAK = 0.02
 """Of the largest amplitude: smaller peaks are not listed."""
 PEAKS = 8
+COLUMNS = 1500
+"""More than a printed plot shows side by side."""
+PATH_POINTS = 6000
+"""Of a path; a longer one is drawn as the places it has been to."""
+PLACES = 250
+"""Along the longer side of such a path."""
 
 
 class Lines(NamedTuple):
@@ -86,7 +93,7 @@ def rms(values: Floats) -> float:
 def lines_of(chosen: Chosen) -> Lines | None:
     """Return the spectra of the chosen samples; None where there are too few, or too many are
     missing."""
-    time_s = chosen.valid["time_s"].to_numpy(np.float64)
+    time_s = chosen.valid("time_s")
     if len(time_s) < 64:
         return None
     step_s = float(np.median(np.diff(time_s)))
@@ -98,10 +105,10 @@ def lines_of(chosen: Chosen) -> Lines | None:
     block = min(LONGEST_BLOCK, 2 ** int(math.log2(len(every) / 2)))
     amplitudes = []
     for name in ("x_mm", "y_mm"):
-        values = np.interp(every, places, chosen.valid[name].to_numpy(np.float64))
+        values = np.interp(every, places, chosen.valid(name))
         f, power = signal.welch(values, 1 / step_s, "hann", block, scaling="spectrum")
         amplitudes.append(np.sqrt(2 * power))
-    sigma_mm = rms(chosen.valid["sigma_x_mm"].to_numpy(np.float64))
+    sigma_mm = rms(chosen.valid("sigma_x_mm"))
     floor_mm = sigma_mm * math.sqrt(4 * HANN_BANDWIDTH / block)
     return Lines(f, amplitudes[0], amplitudes[1], floor_mm, filled)
 
@@ -136,8 +143,8 @@ def figure_of_history(chosen: Chosen) -> Figure:
 
 def figure_of_path_and_lines(chosen: Chosen, lines: Lines | None) -> Figure:
     """Return the path in the marker plane, and the amplitude at each frequency."""
-    x = chosen.valid["x_mm"].to_numpy(np.float64)
-    y = chosen.valid["y_mm"].to_numpy(np.float64)
+    x = chosen.valid("x_mm")
+    y = chosen.valid("y_mm")
     with styled():
         figure = new_figure(3.0)
         if lines is None:
@@ -157,8 +164,11 @@ def figure_of_path_and_lines(chosen: Chosen, lines: Lines | None) -> Figure:
             amplitude.set_ylabel("amplitude, mm")
             amplitude.set_title("Amplitude spectrum")
             amplitude.legend(loc="upper right")
-        step = max(1, len(x) // 6000)
-        path.plot(x[::step], y[::step], color=BLUE, linewidth=0.9)
+        if len(x) <= PATH_POINTS:
+            path.plot(x, y, color=BLUE, linewidth=0.9)
+        else:
+            path.add_collection(_places(x, y))
+            path.autoscale_view()
         path.plot(0, 0, marker="+", color=ORANGE, markersize=9, markeredgewidth=1.2)
         path.set_aspect("equal", adjustable="datalim")
         path.set_xlabel("x, mm")
@@ -167,11 +177,24 @@ def figure_of_path_and_lines(chosen: Chosen, lines: Lines | None) -> Figure:
     return figure
 
 
+def _places(x: Floats, y: Floats) -> PolyCollection:
+    """Return the cells of a fine grid in which samples lie, those side by side as one."""
+    cell = max(float(np.ptp(x)), float(np.ptp(y))) / PLACES or 1e-6
+    x0, y0 = float(x.min()), float(y.min())
+    been = np.zeros((PLACES + 1, PLACES + 3), np.int8)
+    been[((y - y0) / cell).astype(int), ((x - x0) / cell).astype(int) + 1] = 1
+    rows, left = np.nonzero(np.diff(been) > 0)
+    _, right = np.nonzero(np.diff(been) < 0)
+    low, begin, end = y0 + rows * cell, x0 + left * cell, x0 + right * cell
+    corners = np.array([[begin, low], [end, low], [end, low + cell], [begin, low + cell]])
+    return PolyCollection(
+        list(corners.transpose(2, 0, 1)), facecolors=BLUE, edgecolors=BLUE, linewidths=0.3
+    )
+
+
 def figure_of_quality(chosen: Chosen) -> Figure:
     """Return the stated standard deviations and the circles' misfit over time."""
-    valid = chosen.valid
-    time_s = valid["time_s"].to_numpy(np.float64)
-    at_s, gaps = with_gaps(time_s)
+    at_s, gaps = with_gaps(chosen.valid("time_s"))
     with styled():
         figure = new_figure(2.5)
         axes: Any = figure.subplots()
@@ -180,7 +203,7 @@ def figure_of_quality(chosen: Chosen) -> Figure:
             ("sigma_x_mm", "stated standard deviation of x", BLUE),
             ("sigma_y_mm", "of y", GREEN),
         ):
-            values = 1000 * valid[name].to_numpy(np.float64)
+            values = 1000 * chosen.valid(name)
             if np.isfinite(values).any():
                 curve(axes, at_s, np.insert(values, gaps, np.nan), colour, label, linewidth=0.7)
         axes.set_ylim(bottom=0)
@@ -261,9 +284,12 @@ def _draw_axes(axes: Any, homography: Floats) -> None:
 
 
 def _stretches(time_s: Floats, on: Any) -> Sequence[tuple[float, float]]:
-    """Return begin and end of each run of samples that are `on`, at most 500."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
-    return [
-        (float(time_s[a]), float(time_s[min(b, len(time_s) - 1)]))
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
-    ][:500]
+    """Return begin and end of each run of samples that are `on`; runs closer together than the plot
+    can show are one."""
+    edges = np.diff(np.concatenate([[0], on.view(np.int8), [0]]).astype(np.int8))
+    begins_s = time_s[np.flatnonzero(edges > 0)]
+    ends_s = time_s[np.minimum(np.flatnonzero(edges < 0), len(time_s) - 1)]
+    apart = begins_s[1:] - ends_s[:-1] > (time_s[-1] - time_s[0]) / COLUMNS
+    begins_s = begins_s[np.concatenate([[True], apart])] if len(begins_s) else begins_s
+    ends_s = ends_s[np.concatenate([apart, [True]])] if len(ends_s) else ends_s
+    return list(zip(begins_s.tolist(), ends_s.tolist(), strict=True))

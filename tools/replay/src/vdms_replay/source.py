@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,6 +86,19 @@ class Source:
     @property
     def size_bytes(self) -> int:
         return sum(path.stat().st_size for path in self.paths)
+
+    def counted(self) -> tuple[dict[str, int], float] | None:
+        """Return how many messages of each key the files hold by their own word, and how many
+        seconds they span together; None where one of them does not say it."""
+        counts: Counter[str] = Counter()
+        seconds = 0.0
+        for path in self.paths:
+            with open_log(path) as reader:
+                if not reader.counts:
+                    return None
+                counts.update(reader.counts)
+                seconds += reader.length_ns / 1e9
+        return dict(counts), seconds
 
     def items(
         self, types: Sequence[str] | None = None, advance: Callable[[int], None] | None = None

@@ -17,6 +17,7 @@ from vdms_rt.status import status_words
 GAPS_KEPT = 1000
 QUIET_SPAN_S = 1.0
 AXES = ("x_mm", "y_mm", "rotation_mrad")
+MEASURED = ("time_s", *AXES, "sigma_x_mm", "sigma_y_mm")
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,10 +117,11 @@ class MarkerSummary:
         for session, part in table.groupby("session", sort=False):
             self._sequence(str(session), part["seq"].to_numpy(), part["time_s"].to_numpy())
         self._reasons(table["status"])
-        valid = table[table["valid"]]
-        self.valid += len(valid)
-        if len(valid):
-            self._measure(valid)
+        rows = table["valid"].to_numpy(bool)
+        valid = int(rows.sum())
+        self.valid += valid
+        if valid:
+            self._measure({name: table[name].to_numpy()[rows] for name in MEASURED})
 
     def _sequence(self, session: str, seq: NDArray[np.int64], time_s: NDArray[np.float64]) -> None:
         known = self._spans.get(session)
@@ -153,14 +155,14 @@ class MarkerSummary:
                 for flag in status:
                     self.flagged[status_words(flag)] += int(count)
 
-    def _measure(self, valid: pd.DataFrame) -> None:
-        time_s = valid["time_s"].to_numpy()
+    def _measure(self, valid: dict[str, NDArray[np.float64]]) -> None:
+        time_s = valid["time_s"]
         for name, axis in self.axes.items():
-            axis.take(time_s, valid[name].to_numpy())
-        sigmas = valid[["sigma_x_mm", "sigma_y_mm"]].to_numpy()
+            axis.take(time_s, valid[name])
+        sigmas = np.column_stack([valid["sigma_x_mm"], valid["sigma_y_mm"]])
         self._variance += np.nansum(sigmas**2, axis=0)
         self.sigma_x_mm, self.sigma_y_mm = (float(s) for s in np.sqrt(self._variance / self.valid))
-        self._seek_quiet(time_s, valid[["x_mm", "y_mm"]].to_numpy())
+        self._seek_quiet(time_s, np.column_stack([valid["x_mm"], valid["y_mm"]]))
 
     def _seek_quiet(self, time_s: NDArray[np.float64], xy_mm: NDArray[np.float64]) -> None:
         if math.isnan(self.rate_hz) or self.rate_hz <= 0:
