@@ -29,8 +29,8 @@ def add_parser(verbs: Verbs) -> None:
         "write a recording in the format of another program",
         "All samples of all markers (or of one), numbers unchanged, units in the names, times as "
         "UTC and as seconds from the first sample, with what the recording says about itself. "
-        "It takes no more memory for a longer recording. uff58 holds the valid samples, each stretch "
-        "without a gap as a function of its own.",
+        "It takes no more memory for a longer recording. uff58 holds the valid samples, each "
+        "stretch without a gap as a function of its own.",
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
     parser.add_argument("--to", required=True, choices=tuple(FORMATS))

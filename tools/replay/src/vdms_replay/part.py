@@ -25,9 +25,8 @@ from vdms_replay.verb import number
 from vdms_rt.wire import topics
 from vdms_rt.wire import vdms_pb2 as pb
 
-MOST_SAMPLES = 4_000_000
-"""Of one marker; 18.5 hours of NTSC fields. At its peak a verb takes 200 bytes for each, so that it
-stays below 1 GB."""
+MOST_SAMPLES = 2_000_000
+"""Of one marker; 9 hours of NTSC fields."""
 TYPES = (
     SAMPLE, "vdms.Health", "vdms.Event", "vdms.SetUp", "vdms.Run", "vdms.End",
 )  # fmt: skip

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 Floats: TypeAlias = NDArray[np.float64]
 
 LEAST_VALUES = 8
+TIMES_AT_ONCE = 1 << 16
+"""What is held beside them is many times as much."""
 
 
 class SeriesError(ValueError):
@@ -32,16 +34,23 @@ class Series:
         self.start_s, self.step_s = start_s, step_s
         self.values = values
         self.good = good
-        middle = float(np.mean(values[good]))
+        middle = float(np.mean(values, where=good))
         # About the middle, so that the integral below keeps its digits.
         self._middle = middle
-        flat = np.where(good, values - middle, 0.0)
+        flat = values - middle
+        flat[~good] = 0.0
         self._flat = flat
         pieces = np.zeros(len(values))
-        pieces[2:-1] = (-flat[:-3] + 13 * flat[1:-2] + 13 * flat[2:-1] - flat[3:]) / 24
-        self._integral = np.cumsum(pieces)
+        inner = pieces[2:-1]
+        np.add(flat[1:-2], flat[2:-1], out=inner)
+        inner *= 13
+        inner -= flat[:-3]
+        inner -= flat[3:]
+        inner /= 24
+        self._integral = np.cumsum(pieces, out=pieces)
         """Of the cubics from value 1 to value n, in values times steps."""
-        self._bad = np.concatenate([[0], np.cumsum(~good)])
+        self._bad = np.zeros(len(values) + 1, np.int32)
+        np.cumsum(~good, out=self._bad[1:])
 
     def __len__(self) -> int:
         return len(self.values)
@@ -61,6 +70,13 @@ class Series:
     def mean_about(self, times_s: Floats, width_s: float) -> Floats:
         """Return the mean of the series over `width_s` about each time, or for 0 its value there;
         NaN where the series does not reach."""
+        found = np.empty(len(times_s))
+        for begin in range(0, len(times_s), TIMES_AT_ONCE):
+            some = slice(begin, begin + TIMES_AT_ONCE)
+            found[some] = self._mean_about(times_s[some], width_s)
+        return found
+
+    def _mean_about(self, times_s: Floats, width_s: float) -> Floats:
         place = (times_s - self.start_s) / self.step_s
         half = width_s / self.step_s / 2
         first, last = np.floor(place - half), np.floor(place + half)
