@@ -79,6 +79,8 @@ def export(
     Raises ReplayError.
     """
     source = Source(files)
+    target = target_path(source.paths, to, out)
+    keep_existing(target, force=force)
     about = About()
     clock = Clock()
     for item in source.items(ABOUT, advance):
@@ -96,7 +98,6 @@ def export(
         },
         "meanings": {si_name(name) if si else name: text for name, text in MEANINGS.items()},
     }
-    target = target_path(source.paths, to, out)
     counts: dict[str, int] = {}
     with writing(target, to, meta, force=force) as writer:
         for table in _batches(source, Clock(), advance, ROWS_AT_ONCE):
@@ -140,11 +141,16 @@ def target_path(recordings: Sequence[Path], to: str, out: PathLike | None) -> Pa
     return target
 
 
+def keep_existing(path: Path, *, force: bool) -> None:
+    """Raise ReplayError if a file is there that may not be overwritten."""
+    if path.exists() and not force:
+        raise ReplayError(f"{path}: is there already; choose another --out, or --force")
+
+
 @contextlib.contextmanager
 def writing(path: Path, to: str, meta: dict[str, Any], *, force: bool) -> Iterator[Writer]:
     """Give a writer of the file; it gets its name when it is complete. Raises ReplayError."""
-    if path.exists() and not force:
-        raise ReplayError(f"{path}: is there already; choose another --out, or --force")
+    keep_existing(path, force=force)
     begun = path.with_name(path.name + ".part")
     try:
         # Here, since not every library says what is wrong with a place.
