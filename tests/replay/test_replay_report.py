@@ -15,6 +15,7 @@ from vibrometer import Vibrometer
 
 from vdms_replay.chosen import choose
 from vdms_replay.cli import run
+from vdms_replay.figures import new_figure, plain_numbers
 from vdms_replay.load import read
 from vdms_replay.report_figures import lines_of
 
@@ -170,3 +171,18 @@ def test_a_recording_without_a_valid_sample_is_one_sentence(
     assert run(["report", str(path), "--out", str(tmp_path / "r.pdf")]) == 1
     assert "marker m1 has no valid sample" in capsys.readouterr().err
     assert np.isnan(read(path).samples["x_mm"]).all()
+
+
+@pytest.mark.parametrize(
+    ("end", "told"), [(500.0, ["1", "2", "5", "10", "20"]), (5000.0, ["1", "10", "100", "1000"])]
+)
+def test_numbers_of_a_logarithmic_axis_do_not_run_into_each_other(
+    end: float, told: list[str]
+) -> None:
+    axes = new_figure(3.0).subplots()
+    axes.loglog([1.0, end], [1.0, 2.0])
+    axes.set_xlim(1.0, end)
+    plain_numbers(axes.xaxis)
+    labels = axes.xaxis.get_major_formatter()
+    shown = [labels(at) for at in axes.xaxis.get_majorticklocs() if 1 <= at <= end]
+    assert shown[: len(told)] == told

@@ -118,8 +118,10 @@ def density(axes: Axes, f: Floats, values: Floats, colour: str, label: str, **ho
 
 
 def plain_numbers(axis: Axis) -> None:
-    """Number a logarithmic axis as people write it: 0.1, 0.2, 0.5, 1."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    """Number a logarithmic axis as people write it: 0.1, 0.2, 0.5, 1; over three decades and more
+    only 0.1, 1, since the others would run into each other. Its curves are drawn before."""
+    begin, end = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if end < 1000 * begin else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
