@@ -301,3 +301,14 @@ def test_uff58_is_the_same_for_any_size_of_blocks(recording, monkeypatch):
         monkeypatch.setattr("vdms_replay.formats.spill.BLOCK_ROWS", rows)
         assert exported(recording, "uff58", force=True)[0].read_bytes() == whole
     assert [path.name for path in recording.parent.iterdir() if "part" in path.name] == []
+
+
+def test_texts_that_are_all_empty_go_into_a_mat_file(tmp_path):
+    path = tmp_path / "a.mat"
+    writer = FORMATS["mat"][1](path, {"station": "lab"})
+    table = pd.DataFrame({"x_mm": [1.0, 2.0], "said": pd.array(["", ""], dtype="str")})
+    writer.add("m1", table.assign(utc=0, marker="m1"))
+    writer.close()
+    found = scipy.io.loadmat(path)["m1"][0, 0]
+    np.testing.assert_array_equal(found["x_mm"].ravel(), [1.0, 2.0])
+    assert [str(text).strip() for text in found["said"]] == ["", ""]

@@ -114,12 +114,12 @@ class _Column:
             self.size = rows * dtype.itemsize
             self._letters = None
         else:
-            width = max(map(len, texts), default=0)
+            width = max([1, *map(len, texts)])
             # One column of letters for each of the longest text's, blanks behind shorter ones.
             padded = "".join(text.ljust(width) for text in texts)
             self._letters = np.frombuffer(padded.encode("utf-16-le"), np.uint16).reshape(-1, width)
             self._type = UINT16
-            head = _head(CHAR, (rows, width) if width else (0, 0))
+            head = _head(CHAR, (rows, width))
             self.size = 2 * rows * width
         self._head = head
         self.whole_size = len(head) + 8 + self.size + -self.size % 8
