@@ -32,7 +32,7 @@ from vdms_rt.notify import Notifier
 from vdms_rt.outlet import Outlet
 from vdms_rt.process.loop import Processor
 from vdms_rt.publish import Publisher
-from vdms_rt.realtime import lock_memory, scheduling
+from vdms_rt.realtime import lock_memory, scheduling, shared_cpu, stay_on
 from vdms_rt.record import Recorder
 from vdms_rt.ring import Ring
 from vdms_rt.setup import SetUp, SetUpError, load_set_up, save_set_up, set_up_path
@@ -83,6 +83,7 @@ class Daemon:
             live=live,
             patches=config.record.pixels,
         )
+        self._shared_cpu = shared_cpu() if config.source == "v4l2" else None
         self._ring = Ring(config.process.ring_slots, live=live)
         self._search = Search([m.shape for m in config.marker])
         self._capture = Capture(
@@ -106,6 +107,9 @@ class Daemon:
         before anything was measured.
         """
         self._memory_locked = lock_memory()
+        if self._shared_cpu is not None:
+            # OpenCV's own threads, once the process thread needs them, would stay on that CPU too.
+            cv2.setNumThreads(1)
         with self._signals(), self._notifier, contextlib.ExitStack() as sinks:
             if self.config.publish.enabled:
                 self._outlet.publisher = sinks.enter_context(
@@ -159,8 +163,8 @@ class Daemon:
 
     def _start(self) -> dict[str, threading.Thread]:
         bodies: dict[str, Callable[[], None]] = {
-            "capture": lambda: self._capture.run(self._stop),
-            "process": lambda: self._processor.run(self._stop),
+            "capture": lambda: self._together(self._capture.run),
+            "process": lambda: self._together(self._processor.run),
             "find": lambda: self._search.run(self._stop),
         }
         if self._outlet.recorder is not None:
@@ -174,6 +178,14 @@ class Daemon:
         for thread in threads.values():
             thread.start()
         return threads
+
+    def _together(self, body: Callable[[threading.Event], None]) -> None:
+        """Run what hands frames over, or takes them, where the other does too: waking a thread on
+        another CPU takes twice as long, and the image would have to follow it there. A drawn or
+        decoded frame is so much work that the two are better apart."""
+        if self._shared_cpu is not None and not stay_on(self._shared_cpu):
+            self._shared_cpu = None
+        body(self._stop)
 
     def _guarded(self, body: Callable[[], None]) -> None:
         try:
@@ -348,6 +360,9 @@ class Daemon:
         capture = self._capture.counters.state
         return capture if capture is not State.STREAMING else self._processor.counters.state
 
+    def _where(self) -> str:
+        return "on any cpu" if self._shared_cpu is None else f"on cpu {self._shared_cpu}"
+
     def _run_header(self) -> bytes:
         info = self._named_source = self._capture.counters.info
         clock = self._capture.counters.clock
@@ -357,6 +372,7 @@ class Daemon:
             ("host", platform.node()),
             ("system", platform.platform()),
             ("scheduling", scheduling()),
+            ("capture and process", self._where()),
             ("memory", "locked" if self._memory_locked else "not locked"),
             ("python", platform.python_version()),
             ("opencv", cv2.__version__),

@@ -96,6 +96,12 @@ class Outlet:
                 self._age_sum_ms += (time.monotonic_ns() - sample.t_ns) / 1e6
                 self._age_count += 1
 
+    def rehearse(self) -> None:
+        """Go the way of a sample once more without saying anything, so that the next goes it
+        quickly."""
+        if newest := self._recent[self._markers[0]]:
+            convert.displacement_bytes(newest[-1])
+
     def recent(self, marker: str) -> Sequence[Displacement]:
         """Return a marker's last samples, the newest last; any thread may ask."""
         return self._recent[marker].copy()

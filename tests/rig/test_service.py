@@ -75,6 +75,11 @@ def test_first_light(grabber: Grabber) -> None:
     pid = service.pid()
     assert pwd.getpwuid(Path(f"/proc/{pid}").stat().st_uid).pw_name == "vdms-rt"
     assert os.sched_getscheduler(pid) == os.SCHED_FIFO
+    # Capture and process stay together on one CPU, and nothing else has to.
+    allowed = os.sched_getaffinity(0)
+    cpus = [os.sched_getaffinity(int(task.name)) for task in Path(f"/proc/{pid}/task").iterdir()]
+    assert cpus.count({max(allowed)}) == 2
+    assert cpus.count(allowed) == len(cpus) - 2
     (locked_kb,) = re.findall(r"VmLck:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
     assert int(locked_kb) > 10_000
     assert list(RECORDINGS.glob("station_*.mcap.part"))

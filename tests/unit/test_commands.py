@@ -59,6 +59,9 @@ class Told:
     def checkpoint(self, *details: object) -> None:
         """Nor at these."""
 
+    def rehearse(self) -> None:
+        """Only behind a live source."""
+
 
 class Station:
     """The process stage, fed frames of a marker at a place, one after the other."""

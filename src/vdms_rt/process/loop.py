@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+import time
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future
@@ -36,12 +37,14 @@ from vdms_rt.process.pictures import pictures
 from vdms_rt.process.progress import Phase, Plan, Progress
 from vdms_rt.process.step import begin, found, step, trusted
 from vdms_rt.process.zero import zeroed
-from vdms_rt.ring import Ring, RingClosed
+from vdms_rt.ring import Lease, Ring, RingClosed
 from vdms_rt.setup import SetUp, mismatch
 
 SEARCH_S = 0.5
 """Least time between two searches: they cost a quarter of a core at this pace."""
 TAKE_TIMEOUT_S = 0.2
+REHEARSAL_NS = 1_000_000
+"""How long before a frame is due: more than its arrival jitters, too little to cool down again."""
 CHECKPOINT_NS = 1_000_000_000
 """Between two checkpoints: the most that cannot be measured again with the same numbers from a
 file that begins in the middle of a run."""
@@ -61,6 +64,8 @@ class Outlet(Protocol):
     def pixels(
         self, frame: Frame, regions: tuple[tuple[Region, ...], ...], revision: int
     ) -> None: ...
+
+    def rehearse(self) -> None: ...
 
 
 class Search(Protocol):
@@ -114,6 +119,7 @@ class Processor:
         self._outlet = outlet
         self._progress: Progress | None = None
         self._checkpoint_ns = 0
+        self._due_ns = 0
         self._asked_ns: int | None = None
         self._told_missing = False
         self._work = Workspace()
@@ -135,13 +141,32 @@ class Processor:
         """
         while True:
             try:
-                lease = self._ring.take(TAKE_TIMEOUT_S)
+                lease = self._take()
             except RingClosed:
                 return
             if lease is None:
                 continue
             with lease as frame:
                 self._measure(frame, stop)
+
+    def _take(self) -> Lease | None:
+        """Return a lease of the next frame, or None if none came in time.
+
+        Behind a live source it wakes once shortly before, for nothing: what has lain still since
+        the frame before has left the CPU's caches, and the first sample would wait for it.
+        """
+        lease = None
+        until_rehearsal_ns = self._due_ns - REHEARSAL_NS - time.monotonic_ns()
+        if until_rehearsal_ns > 0:
+            lease = self._ring.take(until_rehearsal_ns / 1e9)
+            if lease is None:
+                self._outlet.rehearse()
+        if lease is None:
+            lease = self._ring.take(TAKE_TIMEOUT_S)
+        if lease is not None and self._ring.live:
+            period_ns = min(lease.frame.period_ns, round(TAKE_TIMEOUT_S * 1e9))
+            self._due_ns = time.monotonic_ns() + period_ns
+        return lease
 
     def _measure(self, frame: Frame, stop: threading.Event) -> None:
         progress, looks = self._commanded(self._progress_for(frame), frame)
