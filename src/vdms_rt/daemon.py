@@ -32,7 +32,7 @@ from vdms_rt.notify import Notifier
 from vdms_rt.outlet import Outlet
 from vdms_rt.process.loop import Processor
 from vdms_rt.publish import Publisher
-from vdms_rt.realtime import lock_memory, scheduling, shared_cpu, stay_on
+from vdms_rt.realtime import claimed_cpu, lock_memory, scheduling, stay_on
 from vdms_rt.record import Recorder
 from vdms_rt.ring import Ring
 from vdms_rt.setup import SetUp, SetUpError, load_set_up, save_set_up, set_up_path
@@ -83,7 +83,7 @@ class Daemon:
             live=live,
             patches=config.record.pixels,
         )
-        self._shared_cpu = shared_cpu() if config.source == "v4l2" else None
+        self._shared_cpu: int | None = None
         self._ring = Ring(config.process.ring_slots, live=live)
         self._search = Search([m.shape for m in config.marker])
         self._capture = Capture(
@@ -107,10 +107,11 @@ class Daemon:
         before anything was measured.
         """
         self._memory_locked = lock_memory()
-        if self._shared_cpu is not None:
-            # OpenCV's own threads, once the process thread needs them, would stay on that CPU too.
-            cv2.setNumThreads(1)
         with self._signals(), self._notifier, contextlib.ExitStack() as sinks:
+            if self.config.source == "v4l2":
+                self._shared_cpu = sinks.enter_context(claimed_cpu())
+                # OpenCV's own threads, once the process thread needs them, would stay there too.
+                cv2.setNumThreads(1)
             if self.config.publish.enabled:
                 self._outlet.publisher = sinks.enter_context(
                     Publisher(

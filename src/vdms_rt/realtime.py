@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import resource
+import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 CPUS = Path("/sys/devices/system/cpu")
@@ -34,14 +37,22 @@ def scheduling() -> str:
     return f"{policy} {os.sched_getparam(0).sched_priority}"
 
 
-def shared_cpu(cpus: Path = CPUS) -> int | None:
-    """Return the CPU where two threads that take turns should stay, or None without a choice.
+@contextlib.contextmanager
+def claimed_cpu(cpus: Path = CPUS) -> Iterator[int | None]:
+    """Give the CPU where two threads that take turns should stay, or None without a choice.
 
     It is the fastest that the process may use by what `cpus` says, and of equals the last, because
-    interrupts gather on the first.
+    interrupts gather on the first. One that another station on this computer has claimed is left
+    to it, unless all as fast are claimed.
     """
     allowed = os.sched_getaffinity(0)
-    return max(allowed, key=lambda n: (_speed(cpus / f"cpu{n}"), n)) if len(allowed) > 1 else None
+    if len(allowed) < 2:
+        yield None
+        return
+    speeds = {n: _speed(cpus / f"cpu{n}") for n in allowed}
+    fastest = sorted((n for n in allowed if speeds[n] == max(speeds.values())), reverse=True)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
+        yield next((n for n in fastest if _bound(claim, cpus / f"cpu{n}")), fastest[0])
 
 
 def stay_on(cpu: int) -> bool:
@@ -49,6 +60,15 @@ def stay_on(cpu: int) -> bool:
     return whether the system allows it."""
     try:
         os.sched_setaffinity(0, {cpu})
+    except OSError:
+        return False
+    return True
+
+
+def _bound(claim: socket.socket, cpu: Path) -> bool:
+    """Claim a CPU by a name in the abstract namespace, unix(7), which ends with its process."""
+    try:
+        claim.bind(f"\0vdms-rt {cpu}")
     except OSError:
         return False
     return True

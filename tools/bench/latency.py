@@ -43,7 +43,7 @@ from vdms_rt.model import Damage, Displacement, Frame, Scan
 from vdms_rt.outlet import Outlet
 from vdms_rt.process.loop import Processor
 from vdms_rt.publish import Publisher
-from vdms_rt.realtime import shared_cpu, stay_on
+from vdms_rt.realtime import claimed_cpu, stay_on
 from vdms_rt.record import Recorder
 from vdms_rt.ring import Lease, Ring
 from vdms_rt.subscribe import Sample, subscribe
@@ -115,10 +115,12 @@ def station(out: Path, ended: threading.Event, ready: Callable[[], None]) -> Non
             outlet.event,
         )
         processor = Processor(config, 1, None, ring, search, outlet)
-        with Publisher(
-            config.publish, "bench", ["m1"], sample_rate_hz=SAMPLE_RATE_HZ
-        ) as outlet.publisher:
-            cpu = shared_cpu()
+        with (
+            claimed_cpu() as cpu,
+            Publisher(
+                config.publish, "bench", ["m1"], sample_rate_hz=SAMPLE_RATE_HZ
+            ) as outlet.publisher,
+        ):
 
             def together(body: Callable[[], None]) -> None:
                 if cpu is not None:
