@@ -182,8 +182,8 @@ class Daemon:
 
     def _together(self, body: Callable[[threading.Event], None]) -> None:
         """Run what hands frames over, or takes them, where the other does too: waking a thread on
-        another CPU takes twice as long, and the image would have to follow it there. A drawn or
-        decoded frame is so much work that the two are better apart."""
+        another CPU takes twice as long. A drawn or decoded frame is so much work that the two are
+        better apart."""
         if self._shared_cpu is not None and not stay_on(self._shared_cpu):
             self._shared_cpu = None
         body(self._stop)

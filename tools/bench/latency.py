@@ -52,8 +52,8 @@ from vdms_rt.wire.session import SESSION
 
 PERIOD_NS = 33_366_667
 BARE_PERIOD_NS = PERIOD_NS // 2 + 16_683
-"""A thousandth longer than the samples', so that it meets them in every phase every 17 s: each
-finds caches that the other has warmed, and must not do so in one run and never in the next."""
+"""A thousandth longer than the samples', so that it meets them in every phase every 17 s: what one
+phase makes of the two would otherwise be the figure of a whole run."""
 SAMPLE_RATE_HZ = 60.0
 SETTLE_S = 5.0
 """Not counted: the reference, the readers' history, caches."""

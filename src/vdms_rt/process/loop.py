@@ -44,7 +44,7 @@ SEARCH_S = 0.5
 """Least time between two searches: they cost a quarter of a core at this pace."""
 TAKE_TIMEOUT_S = 0.2
 REHEARSAL_NS = 1_000_000
-"""How long before a frame is due: more than its arrival jitters, too little to cool down again."""
+"""How long before a frame is due: it may come a little early, and little must cool down again."""
 CHECKPOINT_NS = 1_000_000_000
 """Between two checkpoints: the most that cannot be measured again with the same numbers from a
 file that begins in the middle of a run."""
