@@ -171,6 +171,18 @@ def test_spectrum_tells_a_sine_with_holes_in_it(page: Page) -> None:
     assert found[1]["amplitude"] == pytest.approx(0.5, rel=0.05)
 
 
+def test_no_time_is_cut_off_at_the_plots_edge(page: Page) -> None:
+    labels = page.evaluate(
+        """async () => {
+            const { whole } = await import("/static/timeplot.js");
+            const at = (x) => whole(
+                { bbox: { width: 600 * devicePixelRatio }, valToPos: () => x }, 0, "16:57:45");
+            return [at(500), at(577), at(590), at(600)];
+        }"""
+    )
+    assert labels == ["16:57:45", "16:57:45", "", ""]
+
+
 def test_store_keeps_ten_minutes_and_does_not_grow(page: Page) -> None:
     kept = page.evaluate(
         """async () => {

@@ -5,6 +5,8 @@ import { clock, colour } from "/static/format.js";
 
 const LEAST_MM = 0.01;
 const GAP_PERIODS = 1.6;
+const RIGHT_PX = 6;
+const CHARACTER_PX = 7; // of a time's label, at most
 
 /** Points to draw from one time to another: [t, v - sigma, v + sigma, v], null where nothing is.
  * Where samples are denser than pixels, the lowest and highest of each pixel stay. */
@@ -43,6 +45,12 @@ export function points(store, axis, from_s, to_s, width_px, out) {
   return out;
 }
 
+/** The label of a time, or nothing where the plot's edge would cut it off. */
+export function whole(u, s, text) {
+  const room_px = u.bbox.width / devicePixelRatio + RIGHT_PX - u.valToPos(s, "x");
+  return (text.length * CHARACTER_PX) / 2 <= room_px ? text : "";
+}
+
 export class TimePlot {
   /** `view` has from_s and to_s, and is told of zoom(from_s, to_s) and cursor(t_s or null). */
   constructor(root, axis, store, view) {
@@ -50,10 +58,10 @@ export class TimePlot {
     const ink = () => colour("--muted"), grid = { stroke: () => colour("--grid"), width: 1 };
     const line = () => colour(`--${axis}`), none = { show: false };
     this.plot = new uPlot({
-      width: 400, height: 120, padding: [8, 6, 0, 0], legend: none, pxAlign: 0,
+      width: 400, height: 120, padding: [8, RIGHT_PX, 0, 0], legend: none, pxAlign: 0,
       scales: { x: { time: true, range: () => [view.from_s, view.to_s] }, y: { range: () => this.range } },
       axes: [
-        { stroke: ink, grid, ticks: grid, size: 26, space: 90, values: (u, at, _, __, step) => at.map((s) => clock(s, clock_digits(step))) },
+        { stroke: ink, grid, ticks: grid, size: 26, space: 90, values: (u, at, _, __, step) => at.map((s) => whole(u, s, clock(s, clock_digits(step)))) },
         { stroke: ink, grid, ticks: grid, size: 68, space: 26, values: (u, at) => at.map((v) => v.toFixed(decimals(this.range))) },
       ],
       series: [
